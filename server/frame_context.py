@@ -46,9 +46,9 @@ class FrameContext:
     waits_for_light: bool = True
     """Whether the frame waits for the light that is worked out beside it: the same frames then give the same light on
     any machine. Else it is drawn with the newest there is."""
-    follows_discs: bool = True
-    """Whether a disc of the light is exactly where it was found; else it stays where it was drawn until it has moved by
-    `kept_discs.STEADY`."""
+    follows_light: bool = True
+    """Whether all is drawn as the light of this very frame has it; else what was found under nearly the same light is
+    used (kept_discs.py, kept_shadows.py)."""
 
     @property
     def camera_from_volume(self) -> NDArray[np.float64]:

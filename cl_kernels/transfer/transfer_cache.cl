@@ -5,6 +5,7 @@
 // Two places of the table are tried for a cell. Which sample fills a place, and which are traced, depends on the numbers of the samples
 // only, not on the order in which work-items run.
 #include "samples.clh"
+#include "world_cells.clh"
 
 #ifndef BANDS
 #error BANDS must be defined: the number of spherical-harmonics bands
@@ -17,8 +18,6 @@
 #endif
 #define COEFFICIENTS (BANDS * BANDS)
 
-#define WAYS 2
-#define FLAT 2.0f    // height of a cell along the axis that its surface faces, in sides: noise of the surface rarely leaves it
 #define FACING 0.8f  // least cosine between normals of one surface
 #define NOT_STORED (-1)
 #define LENT (1 << 30)  // with the number of the sample whose values a sample takes; a table has fewer places
@@ -40,39 +39,6 @@
 #define TRANSFER (MASK_AT + MASK_WORDS)
 #define MET (TRANSFER + COEFFICIENTS)
 #define WORDS (MET + MOST_MET)
-
-typedef struct {
-    uint2 key;
-    float side_m;
-    int places[WAYS];
-} Cell;
-
-static inline uint mixed(uint h) {
-    h ^= h >> 16;
-    h *= 0x7feb352du;
-    h ^= h >> 15;
-    h *= 0x846ca68bu;
-    return h ^ (h >> 16);
-}
-
-// Sides of cells grow by factors of sqrt(2) with the distance between samples, and are at least sqrt(2) as long.
-static Cell cell_of(const TransferCacheParameters p, const float3 position, const float3 normal) {
-    const int level = (int)ceil(2.0f * log2(fmax(distance(position, p.eye.xyz) * p.spacing, 1e-4f))) + 1;
-    Cell cell;
-    cell.side_m = exp2(0.5f * (float)level);
-    const float3 size = fabs(normal);
-    const int axis = size.x >= size.y && size.x >= size.z ? 0 : size.y >= size.z ? 1 : 2;
-    const float along = axis == 0 ? normal.x : axis == 1 ? normal.y : normal.z;
-    const float3 sides = cell.side_m * (float3)(axis == 0 ? FLAT : 1.0f, axis == 1 ? FLAT : 1.0f, axis == 2 ? FLAT : 1.0f);
-    const int3 at = convert_int3(floor(position / sides));
-    const uint facing = (uint)(2 * axis + (along < 0.0f));
-    cell.key = (uint2)(((uint)at.x & 0xfffffu) | facing << 20 | 1u << 23 | (uint)(level + 64) << 24,
-                       ((uint)at.y & 0xffffu) | ((uint)at.z & 0xffffu) << 16);
-    const uint hash = mixed(cell.key.x ^ mixed(cell.key.y));
-    cell.places[0] = (int)(hash & (uint)(p.places - 1));
-    cell.places[1] = (int)(mixed(hash + 0x9e3779b9u) & (uint)(p.places - 1));
-    return cell;
-}
 
 static inline int holds(global const uint *entry, const uint2 key) {
     return entry[KEY] == key.x && entry[KEY + 1] == key.y;
@@ -114,7 +80,7 @@ kernel void find_samples(const TransferCacheParameters p, global const float4 *p
     const float4 position = positions[pixel], normal = normals[pixel];
     found[sample] = NOT_STORED;
     if (position.w <= 0.0f || normal.w <= 0.0f) return;
-    const Cell cell = cell_of(p, position.xyz, normal.xyz);
+    const Cell cell = cell_of(p.eye.xyz, p.spacing, p.places, position.xyz, normal.xyz);
     for (int way = 0; way < WAYS; way++) {
         const int place = cell.places[way];
         global uint *entry = entries + (size_t)place * WORDS;
@@ -202,7 +168,7 @@ kernel void choose_samples(const TransferCacheParameters p, global const float4 
         atomic_inc(&counts[2 * ORDERS]);
         return;
     }
-    const Cell cell = cell_of(p, position.xyz, normal.xyz);
+    const Cell cell = cell_of(p.eye.xyz, p.spacing, p.places, position.xyz, normal.xyz);
     if (order_of_new(row, col) >= orders) {
         const int lender = lender_of(p.grid, positions, normals, found, orders, row, col, cell.side_m);
         if (lender != NOT_STORED) {
@@ -253,7 +219,7 @@ kernel void store_samples(const TransferCacheParameters p, global const float4 *
     claims[place] = UINT_MAX;
     disc_frames[place] = 0;
     const float3 position = positions[pixel].xyz, normal = normals[pixel].xyz;
-    const Cell cell = cell_of(p, position, normal);
+    const Cell cell = cell_of(p.eye.xyz, p.spacing, p.places, position, normal);
     global uint *entry = entries + (size_t)place * WORDS;
     const int is_known = is_of(entry, cell, position, normal);
     const int lasts = is_known ? min(2 * (int)entry[LASTS], p.longest) : p.period;

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from server.effects.resources import (
     BouncedShadow,
     ChangedScene,
@@ -68,7 +71,7 @@ def shadow_map(context: FrameContext, objects: VirtualObjects, light: SharpLight
         light,
         objects,
         context.ray_length_m,
-        follows_discs=context.follows_discs,
+        follows_discs=context.follows_light,
     )
 
 
@@ -81,10 +84,12 @@ def first_shadow(
 ) -> FirstShadow:
     """What virtual things take from real ones, for the light that they send: an object's underside sees its shadow.
 
-    At every fourth sample: a point of an object sees the shadows of many.
+    At every fourth sample: a point of an object sees the shadows of many. Where shadow_real kept what it found, that is
+    used, which has what the objects sent.
     """
-    engine, camera, surface = context.engine, context.camera, context.surface
-    return FirstShadow(differential.shadow_real(engine, camera, surface, transfer, scene, indirect, samples, step=2))
+    engine, camera, surface, eye = context.engine, context.camera, context.surface, _eye(context)
+    found = differential.shadow_real(engine, camera, surface, transfer, scene, indirect, samples, step=2, eye=eye)
+    return FirstShadow(found)
 
 
 def light_objects(
@@ -115,7 +120,13 @@ def shadow_real(
 ) -> RealShadow:
     """What virtual things take from real ones, less what they send to them (eq. 7.1)."""
     lit = replace(scene, point_lights=lights)
-    return differential.shadow_real(context.engine, context.camera, context.surface, transfer, lit, indirect, samples)
+    engine, camera, surface, eye = context.engine, context.camera, context.surface, _eye(context)
+    return differential.shadow_real(engine, camera, surface, transfer, lit, indirect, samples, eye=eye)
+
+
+def _eye(context: FrameContext) -> NDArray[np.float64] | None:
+    """Where the camera is, for what is kept; None in frames that are drawn as their very light has it."""
+    return None if context.follows_light else context.volume_from_camera[:3, 3]
 
 
 def bounce_real(
@@ -169,7 +180,7 @@ def _changed_by(context: FrameContext, scene: TracedScene, shadow: RealShadow | 
 
 def shade_virtual(context: FrameContext, virtual: VirtualSurface, scene: ChangedScene) -> VirtualOcclusion:
     """What real and virtual things take from virtual ones, less what they send to them."""
-    return VirtualOcclusion(differential.shadow_virtual(context.engine, context.camera, virtual, scene))
+    return VirtualOcclusion(differential.shadow_virtual(context.engine, context.camera, virtual, scene, _eye(context)))
 
 
 def reflect(context: FrameContext, virtual: VirtualSurface, scene: ChangedScene) -> Reflected:

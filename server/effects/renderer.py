@@ -38,6 +38,7 @@ from server.quality.settings import Settings
 from server.reuse.frame_cache import FrameCache
 from server.reuse.temporal_reuse import ReuseDecision
 from server.shading.composite import CompositeInputs, composite, composite_on_device, shown_picture
+from server.shading.kept_shadows import SHADOWS_OF_KNOWN_PLACES
 from server.shading.layer import Layer, compose_layer
 from server.shading.tone_mapping import AverageMemory, Averages, measure_averages
 from server.shading.traced_scene import DeviceLight, upload_light
@@ -199,7 +200,10 @@ class Renderer:
         )
         given = _given(context, spine, light, averages, facts)
         effects = make_plan(EFFECTS, PictureParts, given, facts, everything=self._everything, stages=spine.left_out)
-        return effects.execute(given), effects.described()
+        parts, plan = effects.execute(given), effects.described()
+        if not context.follows_light and (parts.ratio or parts.occluded):
+            plan = structs.replace(plan, left_out=(*plan.left_out, SHADOWS_OF_KNOWN_PLACES))
+        return parts, plan
 
     def _averages(self, context: FrameContext, spine: SpineOutputs, settings: Settings) -> Averages | None:
         """Mean luminances of the picture and of its shading; None where virtual things are not to match them."""

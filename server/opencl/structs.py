@@ -176,6 +176,20 @@ TRANSFER_CACHE_PARAMETERS = Struct(
 """Parameters of transfer_cache.cl. eye: where the camera is, volume metres; spacing: metres between samples that are a
 metre away; most: samples that a frame traces."""
 
+SHADOW_CELLS = Struct(
+    "ShadowCells",
+    eye="float4",
+    spacing="float",
+    level="float",
+    places="int",
+    since="int",
+    turns="int",
+    turn="int",
+)
+"""A table of kept_shadows.clh. eye, spacing: as in TransferCacheParameters; level: of the light's radiance, which
+values are relative to; places: 0 where nothing is kept; since: what was found in this frame or
+later is true; turn: of the `turns` parts of the places, the one that is found anew."""
+
 LOOK_UP_PARAMETERS = Struct(
     "LookUpParameters",
     grid=GRID,
@@ -268,6 +282,7 @@ STRUCTS = (
     DIRECT_PARAMETERS,
     TRANSFER_PARAMETERS,
     TRANSFER_CACHE_PARAMETERS,
+    SHADOW_CELLS,
     LOOK_UP_PARAMETERS,
     GATHER_PARAMETERS,
     VIEW_TRANSFER_PARAMETERS,

@@ -18,6 +18,7 @@ from server.objects.dirty_region import DirtyRegion, box_around
 from server.objects.rasterize import VirtualSurface
 from server.opencl.buffers import BufferDescription, StageBuffers, Workspace
 from server.opencl.engine import Engine, KernelArgument, float4, int4
+from server.shading.shadow_cells import RealShadows, VirtualOcclusions, no_cells, shadow_cells
 from server.shading.traced_scene import Changed, TracedScene
 from server.shading.virtual_point_lights import PlacedPoints, VirtualPointLights, place_points
 from server.transfer.indirect import Indirect, no_hits
@@ -86,17 +87,22 @@ def shadow_real(
     indirect: Indirect | None = None,
     samples: DirectSamples | None = None,
     step: int = 1,
+    eye: NDArray[np.float64] | None = None,
 ) -> RealShadow:
     """Ratio R' / R of real surface shaded with and without the objects, at the transfer's samples (eq. 7.1).
 
     indirect: radiance from surfaces at the same samples; samples: what the discs of the light bring there. step: blocks
-    of step x step samples are shaded as the first of them.
+    of step x step samples are shaded as the first of them. eye: [3] where the camera is, volume metres: ratios that are
+    kept at places of the world (shadow_cells.py) are used, and, unless in blocks, kept. None: all are found anew.
     """
     shape, buffers = (transfer.rows, transfer.cols), engine.buffers(_Buffers)
     ratio, shaded = buffers.ratio.array(shape), buffers.shaded.array(shape)
     whole: RealShadow | None = None
     if samples is not None:
         whole = RealShadow(transfer.stride, buffers.whole_ratio.array(shape), buffers.whole_shaded.array(shape))
+    found, cells = RealShadow(transfer.stride, ratio, shaded, whole), None
+    if eye is not None:
+        cells = shadow_cells(engine, RealShadows, camera, eye, scene, found, fills=step == 1)
     engine.launch(
         engine.kernel("differential_rendering.cl", "shadow_real", **_sample_defines(engine, transfer, scene)),
         (engine.sharers * -(-transfer.cols // step), -(-transfer.rows // step)),
@@ -107,13 +113,18 @@ def shadow_real(
         transfer.coefficients,
         indirect.hits if indirect else no_hits(engine, transfer),
         *_direct_arguments(engine, samples),
+        *(cells.arguments() if cells else no_cells(engine)),
+        cells is not None and step == 1,
+        cells.asked if cells else engine.unused,
         ratio,
         shaded,
         *((whole.values, whole.shaded) if whole else (engine.unused, engine.unused)),
         local=_local(engine),
         steps=-(-scene.rays.count // engine.sharers),
     )
-    return RealShadow(transfer.stride, ratio, shaded, whole)
+    if cells and step == 1:
+        cells.keep(engine, camera, found, found.all, ratio)
+    return found
 
 
 def bounce_real(
@@ -180,12 +191,24 @@ def _local(engine: Engine) -> tuple[int, int]:
     return (16, 4) if engine.sharers == 1 else (engine.sharers, SHARED_ITEMS // engine.sharers)
 
 
-def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface, scene: TracedScene) -> SampleGrid:
-    """Radiance that real and virtual occluders take from the virtual surface, at every VIRTUAL_STRIDE-th pixel."""
+def shadow_virtual(
+    engine: Engine,
+    camera: CameraModel,
+    virtual: VirtualSurface,
+    scene: TracedScene,
+    eye: NDArray[np.float64] | None = None,
+) -> SampleGrid:
+    """Radiance that real and virtual occluders take from the virtual surface, at every VIRTUAL_STRIDE-th pixel.
+
+    eye: as in shadow_real.
+    """
     shape = (camera.height // VIRTUAL_STRIDE, camera.width // VIRTUAL_STRIDE)
     buffers = engine.buffers(_Buffers)
     occluded = SampleGrid(VIRTUAL_STRIDE, buffers.occluded.array(shape))
-    covered = occluded.inside(box_around(virtual.boxes))
+    covered, cells = occluded.inside(box_around(virtual.boxes)), None
+    if eye is not None:
+        level = float(scene.light.mean.mean())
+        cells = shadow_cells(engine, VirtualOcclusions, camera, eye, scene, occluded, level)
     with buffers.drawn.redraw(occluded.values, covered, occluded.all) as (x0, y0, x1, y1):
         engine.launch(
             engine.kernel("differential_rendering.cl", "shadow_virtual", **_defines(engine, scene)),
@@ -196,10 +219,14 @@ def shadow_virtual(engine: Engine, camera: CameraModel, virtual: VirtualSurface,
             virtual.position,
             virtual.normal,
             virtual.object_index,
+            *(cells.arguments() if cells else no_cells(engine)),
+            *((cells.asked, cells.found) if cells else (engine.unused,) * 2),
             occluded.values,
             local=_local(engine),
             steps=-(-scene.rays.count // (scene.rays.interleave * engine.sharers)),
         )
+        if cells:
+            cells.keep(engine, camera, occluded, (x0, y0, x1, y1), cells.found)
     return occluded
 
 

@@ -51,6 +51,8 @@ class DeviceLight:
     below 0, and blocking negative light would brighten."""
     sh: NDArray[np.float64]
     """[places, bands^2, 3]: coefficients of the whole light."""
+    rest: NDArray[np.float64]
+    """The same without discs."""
     places: LightPlaces
     unseen: NDArray[np.float64]
     """[3] radiance from blocked directions whose blocker no picture shows; 0 without indirect light."""
@@ -237,6 +239,7 @@ def upload_light(
         np.maximum(0.5 / np.sqrt(np.pi) * sh[:, 0], 0.0).mean(axis=0),
         tabulate_light(engine, buffers.rest_table if discs else buffers.table, rays, rest, sh, places),
         sh,
+        rest,
         places,
         exposure * indirect.mean if indirect else np.zeros(3),
         exposure if indirect else 0.0,

@@ -1,0 +1,134 @@
+"""How long what virtual things take from the light stays true where it was found.
+
+What they take from a place of real surface, R' / R of eq. 7.1, depends on the place, on the things and on the light
+from all sides, but not on the camera. So does what real and virtual things take from virtual surface. Both are kept by
+cell of the world (shadow_cells.py). Each frame finds them anew in one of TURNS parts of the cells, because the scan
+grows, and the light of a room is estimated every few frames and moves a little each time; and in all of them when a
+thing has moved, or the light has become another.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from protocol.messages import LeftOut
+from server.objects.rasterize import Placed
+from server.shading.traced_scene import TracedScene
+from server.transfer.radiance_transfer import Directions
+from server.volume.volume import Volume
+
+TURNS = 8
+"""Frames in which all cells have their turn; a power of two. Half of those after which transfer is traced again."""
+NO_TURN = -1
+"""None is found anew but for a reason."""
+STEADY = 0.05
+"""How much the light may differ from the one that a shadow was found under, as a share of its coefficients' norm at the
+same level: so much of a shadow's depth, in the mean over directions. A solution of the real kitchen moves its light by
+.02. With it, pictures of its frames 20 to 49 differ from those that are traced anew, with four times as many samples of
+the object, by FLIP .0022 instead of .0021; with twice as much by .0025."""
+SHADOWS_OF_KNOWN_PLACES = LeftOut(
+    effect="shadows_of_known_places",
+    reason=f"found at the same place under a light that differs by {STEADY:.0%} at most; an eighth is found anew",
+    error_bound=None,
+)
+_REMEMBERED = 80
+"""Frames. What was found earlier is found anew when it is seen again."""
+
+
+@dataclass(frozen=True)
+class SplitSh:
+    """Coefficients of a light, [places, bands^2, 3] each."""
+
+    rest: NDArray[np.float64]
+    """Without discs: what R and R' are of."""
+    discs: NDArray[np.float64]
+    """The discs' own."""
+
+
+@dataclass(frozen=True)
+class ShadowCause:
+    """What shadows depend on besides the surface that they fall on."""
+
+    volume: Volume
+    objects: Sequence[Placed]
+    light: SplitSh
+    is_sent: bool
+    """Whether surfaces send light."""
+    rays: Directions
+    ray_length_m: float
+
+    @staticmethod
+    def of(scene: TracedScene) -> ShadowCause:
+        """The scene's."""
+        light = SplitSh(scene.light.rest, scene.light.sh - scene.light.rest)
+        is_sent = scene.light.surface_gain > 0.0
+        return ShadowCause(scene.volume, scene.objects, light, is_sent, scene.rays, scene.ray_length_m)
+
+    def is_near(self, other: ShadowCause) -> bool:
+        """Whether shadows under `other` are nearly the same."""
+        return (
+            (self.is_sent, self.ray_length_m) == (other.is_sent, other.ray_length_m)
+            and self.volume is other.volume
+            and self.rays is other.rays
+            and _are_same(self.objects, other.objects)
+            and light_difference(other.light, self.light) <= STEADY
+        )
+
+
+class KeptShadows:
+    """The causes of the shadows of one session's last frames."""
+
+    def __init__(self) -> None:
+        self._causes: deque[ShadowCause] = deque(maxlen=_REMEMBERED)
+        self.now = 0
+        """Number of the last frame, from 1; 0: none."""
+
+    def since(self, cause: ShadowCause) -> int:
+        """The first frame from which on all causes are nearly `cause`; if the last one's is not, this frame."""
+        first = self.now + 1
+        for earlier in reversed(self._causes):
+            if not earlier.is_near(cause):
+                break
+            first -= 1
+        return first
+
+    def begin_frame(self, cause: ShadowCause) -> int:
+        """Number of this frame, from 1, whose shadows are kept."""
+        self._causes.append(cause)
+        self.now += 1
+        return self.now
+
+
+def light_difference(light: SplitSh, before: SplitSh) -> float:
+    """How much `before` differs from `light` at the level where their rests are nearest, in the place where most.
+
+    A share of the norm of the rest, or of the discs if that is larger: virtual things send light of the discs, which
+    counts by how much it adds to the rest. Infinite where one has other places, or is dark and the other is not.
+    """
+    if light.rest.shape != before.rest.shape:
+        return np.inf
+    size, other = _norms(light.rest), _norms(before.rest)
+    is_dark = (size == 0.0) | (other == 0.0)
+    if is_dark.any():
+        return 0.0 if is_dark.all() and not (size.any() or other.any()) else np.inf
+    level = np.maximum(np.einsum("pij,pij->p", light.rest, before.rest), 0.0) / other**2
+    of_rest = _norms(light.rest - level[:, None, None] * before.rest) / size
+    of_discs = _norms(light.discs - level[:, None, None] * before.discs) / np.maximum(_norms(light.discs), size)
+    return float(np.maximum(of_rest, of_discs).max())
+
+
+def _norms(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[places]."""
+    return np.asarray(np.linalg.norm(coefficients, axis=(1, 2)))
+
+
+def _are_same(objects: Sequence[Placed], others: Sequence[Placed]) -> bool:
+    return len(objects) == len(others) and all(
+        thing is other and np.array_equal(matrix, place)
+        for (thing, matrix), (other, place) in zip(objects, others, strict=True)
+    )

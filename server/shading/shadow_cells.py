@@ -1,0 +1,150 @@
+"""Tables in which what virtual things take from the light is kept by cell of the world.
+
+One is of the shadows on real surface, one of what occluders take from virtual surface. How long a value is true,
+kept_shadows.py says. Kernels: keep_shadows of kept_shadows.cl; include/kept_shadows.clh.
+
+A table is a hash of cells, with one place for each: of two cells that ask for the same place, the one that asked last
+has it. The first of a frame's samples in a cell fills it, whatever the order in which work-items run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pyopencl.array as cl_array
+import pyopencl.cltypes as cl_types
+from numpy.typing import NDArray
+
+from protocol.frames import CameraModel
+from server.objects.pixel_boxes import PixelBox
+from server.opencl.buffers import BufferDescription, StageBuffers, Workspace
+from server.opencl.engine import Engine, KernelArgument, float4, int4
+from server.opencl.structs import SHADOW_CELLS
+from server.shading.kept_shadows import NO_TURN, TURNS, KeptShadows, ShadowCause
+from server.shading.traced_scene import TracedScene
+from server.transfer.sample_grid import SampleGrid, grid_of
+
+WORDS = 8
+"""Of an entry."""
+
+
+class ShadowTable(StageBuffers):
+    """One session's table of one kind."""
+
+    places_a_sample: ClassVar[float]
+    """Size of the table, in samples of a frame, rounded up to a power of two; 32 bytes each."""
+
+    table = BufferDescription(np.uint32)
+    """[places, WORDS] as in kept_shadows.clh."""
+    asked = BufferDescription(cl_types.int4)
+    """[rows, cols] the cells that samples ask to fill."""
+    found = BufferDescription(cl_types.float4)
+    """[rows, cols] what they fill them with."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace)
+        self.memory: KeptShadows = KeptShadows()
+        self.places = 0
+
+    def reserve(self, engine: Engine, samples: int) -> None:
+        """Room for the cells of so many samples; what was kept for another number is forgotten."""
+        places = places_for(int(self.places_a_sample * samples))
+        if places != self.places:
+            kernel = engine.kernel("shading/kept_shadows.cl", "begin_shadows")
+            engine.launch(kernel, (places,), places, self.table.array((places, WORDS)))
+            self.places = places
+
+
+class RealShadows(ShadowTable):
+    """R' / R of real surface."""
+
+    places_a_sample = 4
+
+
+class VirtualOcclusions(ShadowTable):
+    """Radiance that occluders take from virtual surface, which fills a part of a picture."""
+
+    places_a_sample = 1
+
+
+@dataclass(frozen=True)
+class ShadowCells:
+    """The cells of one frame's samples."""
+
+    parameters: np.void
+    """SHADOW_CELLS of structs.py."""
+    table: cl_array.Array
+    """[places, WORDS]."""
+    asked: cl_array.Array
+    found: cl_array.Array
+    now: int
+    """Number of this frame, from 1; 0 where nothing is filled."""
+
+    def arguments(self) -> tuple[KernelArgument, ...]:
+        """SHADOW_CELLS of kept_shadows.clh."""
+        return self.parameters, self.table
+
+    def keep(
+        self, engine: Engine, camera: CameraModel, samples: SampleGrid, around: PixelBox, found: cl_array.Array
+    ) -> None:
+        """Keep what was found at the samples `around`, in a kernel before; found: [rows, cols] float4."""
+        engine.launch(
+            engine.kernel("shading/kept_shadows.cl", "keep_shadows"),
+            (around[2] - around[0], around[3] - around[1]),
+            grid_of(samples, camera),
+            int4(*around),
+            self.now,
+            found,
+            self.asked,
+            self.table,
+        )
+
+
+def shadow_cells(
+    engine: Engine,
+    kind: type[ShadowTable],
+    camera: CameraModel,
+    eye: NDArray[np.float64],
+    scene: TracedScene,
+    samples: SampleGrid,
+    level: float = 1.0,
+    *,
+    fills: bool = True,
+) -> ShadowCells:
+    """The cells for a frame's `samples`.
+
+    eye: [3] where the camera is, volume metres. level: of the light's radiance, where values are radiance. fills: the
+    frame's number and turn go on; else what is kept is only looked up.
+    """
+    table, count = engine.buffers(kind), samples.rows * samples.cols
+    table.reserve(engine, count)
+    cause = ShadowCause.of(scene)
+    since = table.memory.since(cause)
+    now = table.memory.begin_frame(cause) if fills else 0
+    parameters = SHADOW_CELLS(
+        eye=float4(*eye, 0.0),
+        spacing=samples.stride / camera.fx,
+        level=max(level, float(np.finfo(np.float32).tiny)),
+        places=table.places,
+        since=since,
+        turns=TURNS,
+        turn=now % TURNS if fills else NO_TURN,
+    )
+    shape = (samples.rows, samples.cols)
+    by_sample = table.asked.array(shape), table.found.array(shape)
+    return ShadowCells(parameters, table.table.array((table.places, WORDS)), *by_sample, now)
+
+
+def no_cells(engine: Engine) -> tuple[KernelArgument, ...]:
+    """SHADOW_CELLS of kept_shadows.clh where nothing is kept."""
+    return _NOTHING, engine.unused
+
+
+_NOTHING = SHADOW_CELLS(eye=float4(0, 0, 0, 0), spacing=1.0, level=1.0, places=0, since=0, turns=TURNS, turn=NO_TURN)
+
+
+def places_for(count: int) -> int:
+    """The least power of two that is not less."""
+    return 1 << (max(count, 1) - 1).bit_length()

@@ -59,6 +59,8 @@ class ShadowCause:
     light: SplitSh
     is_sent: bool
     """Whether surfaces send light."""
+    by_views: bool
+    """Whether visibility is looked up in depth views; else rays are traced."""
     rays: Directions
     ray_length_m: float
 
@@ -66,13 +68,14 @@ class ShadowCause:
     def of(scene: TracedScene) -> ShadowCause:
         """The scene's."""
         light = SplitSh(scene.light.rest, scene.light.sh - scene.light.rest)
-        is_sent = scene.light.surface_gain > 0.0
-        return ShadowCause(scene.volume, scene.objects, light, is_sent, scene.rays, scene.ray_length_m)
+        is_sent, by_views = scene.light.surface_gain > 0.0, scene.depth_views is not None
+        return ShadowCause(scene.volume, scene.objects, light, is_sent, by_views, scene.rays, scene.ray_length_m)
 
     def is_near(self, other: ShadowCause) -> bool:
         """Whether shadows under `other` are nearly the same."""
         return (
-            (self.is_sent, self.ray_length_m) == (other.is_sent, other.ray_length_m)
+            (self.is_sent, self.by_views) == (other.is_sent, other.by_views)
+            and self.ray_length_m == other.ray_length_m
             and self.volume is other.volume
             and self.rays is other.rays
             and _are_same(self.objects, other.objects)

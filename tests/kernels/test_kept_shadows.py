@@ -177,6 +177,21 @@ def test_what_shadows_are_of_is_remembered(engine: Engine) -> None:
     assert since(LIGHT) == 11
 
 
+def test_shadows_of_other_rays_or_another_scan_are_others(engine: Engine) -> None:
+    stage = Stage.of(engine)
+    scene = stage.scene(LIGHT)
+    cause, light = ShadowCause.of(scene), scene.light
+    assert cause.is_near(ShadowCause.of(stage.scene(LIGHT)))
+    others = [
+        replace(scene, rays=direction_sets(33, 4)),
+        replace(scene, ray_length_m=0.5 * FAR_M),
+        replace(scene, volume=fill_volume(engine, FLOOR, 2 * VOXEL_M)),
+        replace(scene, light=replace(light, surface_gain=1.0)),
+    ]
+    assert not any(cause.is_near(ShadowCause.of(other)) for other in others)
+    assert not cause.is_near(replace(cause, by_views=True))
+
+
 # ---- shadows on real surface ---------------------------------------------------------------------------------------
 
 

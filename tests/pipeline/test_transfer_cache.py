@@ -103,6 +103,21 @@ def test_where_no_sample_waits_the_first_frame_is_that_without(
     assert 0 < np.abs(first[1 / 8].astype(int) - first["off"]).max() <= 4  # seen: 2
 
 
+def test_the_plan_says_which_shadows_were_found_before(device: Device) -> None:
+    """None without caches, none where nothing virtual is lit, and none in a view at rest, which is drawn as it is."""
+    said: dict[tuple[str, str], list[bool]] = {}
+    for name, cache in (("closed-room", "on"), ("closed-room", "off"), ("nothing", "on"), ("still", "on")):
+        source = GallerySource(name, width=160)
+        said[name, cache] = [
+            "shadows_of_known_places" in {left.effect for left in result.plan.left_out}
+            for _, result in play(device, source, wishes_of(source, cache=cache))
+        ]
+    assert all(said["closed-room", "on"])
+    assert not any(said["closed-room", "off"] + said["nothing", "on"])
+    assert said["still", "on"][0]
+    assert not said["still", "on"][-1]
+
+
 @pytest.mark.parametrize("preset", ["reg4", "art4", "gr15fast"])
 def test_a_thing_that_comes_in_shades_nearly_as_without(device: Device, preset: Preset) -> None:
     """A real ball: cells keep, until they are traced again, what they saw of the scan before it came."""

@@ -43,11 +43,11 @@ static void write_block(const Grid grid, global const float4 *positions, global 
 // where objects take nothing: other parts of the light (shadow_map.cl), bounces and refined pixels (adaptive.cl) relate to it.
 // SHARERS items a block of `step` x `step` samples, which get the ratio of the first of them, or none where that has no surface.
 // whole, whole_shaded [rows][cols]: ratio and R with what the discs bring, written if has_discs.
-// Samples whose cell has a ratio get that one, but for cells that have their turn. Of the others, those that are `asking` ask to fill it
-// -> asked [rows][cols].
+// Samples whose cell keeps a ratio get that one. Of the others, if `asking`, each asks to fill its cell -> asked [rows][cols], found
+// [rows][cols]: the cell's value then.
 kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, global const float *transfer, global const float4 *hits,
-                        DISC_SAMPLES, SHADOW_CELLS, const int asking, global int4 *asked, global float4 *ratio, global float4 *shaded,
-                        global float4 *whole, global float4 *whole_shaded) {
+                        DISC_SAMPLES, SHADOW_CELLS, const int asking, global int4 *asked, global float4 *found, global float4 *ratio,
+                        global float4 *shaded, global float4 *whole, global float4 *whole_shaded) {
     SHARED_PARTS
     const int sharer = SHARER;
     const int col = step * (get_global_id(0) / SHARERS);
@@ -59,11 +59,9 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
     const int is_known = is_inside && position.w > 0.0f && normal.w > 0.0f;
     const int place = place_near(scene.light.table, light_table, position.xyz);
     const Arriving arrives = ARRIVING_UNCHANGED(place);
-    const ShadowCell cell = shadow_cell(cells, position, normal.xyz, -1);
-    const float4 before = kept_in(cells, cell, table);
-    const int is_kept = before.w > 0.0f && !has_turn(cells, cell);
+    ShadowCell cell = find_shadow(cells, table, position, normal.xyz, -1);
     float4 own_part = (float4)(0.0f);
-    if (is_known && !is_kept) {
+    if (is_known && !cell.is_kept) {
         const Volume volume = SOLIDS_OF_SCENE;
         const Objects things = OBJECTS_OF_SCENE(0.0f);
         global const uint *free = free_mask + sample * MASK_WORDS;
@@ -80,14 +78,14 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
         for (int i = 0; i < COEFFICIENTS; i++) without += transfer[sample * COEFFICIENTS + i] * light[i].xyz;
         without = shading_without(arrives, without, openness[sample], hits[sample]);
         const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
-        of_ratio = is_kept ? before : (float4)(fmax(without - taken, floor) / fmax(without, floor), 1.0f);
+        const float3 own = fmax(without - taken, floor) / fmax(without, floor);
+        const float4 value = cell.is_kept ? cell.value : with_found(cells, cell, own);
+        of_ratio = (float4)(value.xyz, 1.0f);
+        if (asking) found[sample] = value;
         of_shaded = (float4)(without, 1.0f);
     }
-    if (asking) {
-        ShadowCell filled = cell;
-        if (is_kept || !is_known) filled.place = -1;
-        ask_to_keep(filled, sample, table, asked);
-    }
+    if (!is_known) cell.place = -1;
+    if (asking) ask_to_keep(cell, sample, table, asked);
     write_block(grid, positions, normals, row, col, step, of_ratio, of_shaded, ratio, shaded, has_discs, least, without_discs, with_discs,
                 whole, whole_shaded);
 }
@@ -149,14 +147,11 @@ kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, const int most,
         bounced_rest[sample] = without_discs_of(ratio, rest[sample].xyz, without_discs[sample].xyz, with_discs[sample].xyz, least.xyz);
 }
 
-#define SETS_OF_CELL 4  // samples that a cell's mean is of, each with a direction set of its own, times scene.every
-
 // Virtual surface: the radiance that real and virtual occluders take from it, at the samples that it covers.
 // positions, normals [h][w] (w = 1 where covered), shown [h][w] (which object, -1 none): the virtual geometry buffer.
 // scene.every: a sample traces every n-th direction of its set; its neighbours trace others. -> occluded [rows][cols] (rgb, w = 1 valid)
 // at the samples `around` (x0 y0 x1 y1, half-open).
-// A sample finds its own, and asks to add it to the mean of its cell, which is over cells.level, until all directions of a set are in
-// that, and then where the cell has its turn. -> found [rows][cols]: the mean with what the sample found; asked [rows][cols].
+// Samples whose cell keeps what is taken, over cells.level, get that; the others ask to fill it. -> found, asked: as in shadow_real.
 kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const float4 *positions, global const float4 *normals, global const int *shown,
                            SHADOW_CELLS, global int4 *asked, global float4 *found, global float4 *occluded) {
     SHARED_PARTS
@@ -167,25 +162,22 @@ kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const flo
     const int is_inside = col < around.z && row < around.w;
     const int sample = is_inside ? row * grid.cols + col : 0, every = scene.every, pixel = is_inside ? sample_pixel(grid, row, col) : 0;
     const float4 position = positions[pixel], normal = normals[pixel];
-    ShadowCell cell = shadow_cell(cells, position, normal.xyz, shown[pixel]);
-    const float4 before = kept_in(cells, cell, table);
-    const int is_kept = before.w >= (float)every && !has_turn(cells, cell);
+    const ShadowCell cell = find_shadow(cells, table, position, normal.xyz, shown[pixel]);
     float4 own = (float4)(0.0f);
-    if (is_inside && !is_kept) {
+    if (is_inside && !cell.is_kept) {
         const Volume volume = VOLUME_OF_SCENE;
         const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
         const Arriving arrives = ARRIVING_OF_SCENE(place_of_object(scene.light.table, light_table, shown[pixel]));
         own = taken_from_virtual(volume, things, arrives, position, normal.xyz, direction_set(row, col),
-                                 direction_subset(row, col + (int)before.w, every) + every * sharer, every * SHARERS);
+                                 direction_subset(row, col + cells.now, every) + every * sharer, every * SHARERS);
     }
     const float4 taken = SUM_OF_SHARERS(own) / SHARERS;
     if (!(is_inside & (sharer == 0))) return;
-    const float part = is_kept ? 0.0f : 1.0f / fmin(before.w + 1.0f, (float)(SETS_OF_CELL * every));
-    const float3 mean = mix(before.xyz, taken.xyz / cells.level, part);
-    occluded[sample] = before.w > 0.0f ? (float4)(cells.level * mean, 1.0f) : taken;
+    occluded[sample] = taken;
     if (cells.places == 0) return;
-    found[sample] = (float4)(mean, before.w + 1.0f);
-    if (is_kept) cell.place = -1;
+    const float4 value = cell.is_kept ? cell.value : with_found(cells, cell, taken.xyz / cells.level);
+    if (cell.is_true) occluded[sample] = (float4)(cells.level * value.xyz, 1.0f);
+    found[sample] = value;
     ask_to_keep(cell, sample, table, asked);
 }
 

@@ -115,7 +115,7 @@ def shadow_real(
         *_direct_arguments(engine, samples),
         *(cells.arguments() if cells else no_cells(engine)),
         cells is not None and step == 1,
-        cells.asked if cells else engine.unused,
+        *((cells.asked, cells.found) if cells else (engine.unused,) * 2),
         ratio,
         shaded,
         *((whole.values, whole.shaded) if whole else (engine.unused, engine.unused)),
@@ -123,7 +123,7 @@ def shadow_real(
         steps=-(-scene.rays.count // engine.sharers),
     )
     if cells and step == 1:
-        cells.keep(engine, camera, found, found.all, ratio)
+        cells.keep(engine, camera, found, found.all)
     return found
 
 
@@ -226,7 +226,7 @@ def shadow_virtual(
             steps=-(-scene.rays.count // (scene.rays.interleave * engine.sharers)),
         )
         if cells:
-            cells.keep(engine, camera, occluded, (x0, y0, x1, y1), cells.found)
+            cells.keep(engine, camera, occluded, (x0, y0, x1, y1))
     return occluded
 
 

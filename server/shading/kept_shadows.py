@@ -2,9 +2,9 @@
 
 What they take from a place of real surface, R' / R of eq. 7.1, depends on the place, on the things and on the light
 from all sides, but not on the camera. So does what real and virtual things take from virtual surface. Both are kept by
-cell of the world (shadow_cells.py). Each frame finds them anew in one of TURNS parts of the cells, because the scan
-grows, and the light of a room is estimated every few frames and moves a little each time; and in all of them when a
-thing has moved, or the light has become another.
+cell of the world (shadow_cells.py). A value is found anew in the next frame, because a young scan grows from frame to
+frame; if it is the same, after two, four, LONGEST; if not, sooner again. When a thing has moved, or the light has
+become another, all are found anew. The light of a room is estimated every few frames and moves a little each time.
 """
 
 from __future__ import annotations
@@ -22,18 +22,17 @@ from server.shading.traced_scene import TracedScene
 from server.transfer.radiance_transfer import Directions
 from server.volume.volume import Volume
 
-TURNS = 8
-"""Frames in which all cells have their turn; a power of two. Half of those after which transfer is traced again."""
-NO_TURN = -1
-"""None is found anew but for a reason."""
+LONGEST = 8
+"""Frames after which a value is found anew at the latest; a power of two. Half of those after which transfer is traced
+again for the first time."""
 STEADY = 0.05
 """How much the light may differ from the one that a shadow was found under, as a share of its coefficients' norm at the
 same level: so much of a shadow's depth, in the mean over directions. A solution of the real kitchen moves its light by
-.02. With it, pictures of its frames 20 to 49 differ from those that are traced anew, with four times as many samples of
-the object, by FLIP .0022 instead of .0021; with twice as much by .0025."""
+.02; pictures of its frames 20 to 49 differ from those that are traced anew, with four times as many samples of the
+object, by FLIP .0021 with and without kept shadows."""
 SHADOWS_OF_KNOWN_PLACES = LeftOut(
     effect="shadows_of_known_places",
-    reason=f"found at the same place under a light that differs by {STEADY:.0%} at most; an eighth is found anew",
+    reason=f"found at the same place in the last {LONGEST} frames, under a light that differs by {STEADY:.0%} at most",
     error_bound=None,
 )
 _REMEMBERED = 80

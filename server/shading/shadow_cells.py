@@ -22,7 +22,7 @@ from server.objects.pixel_boxes import PixelBox
 from server.opencl.buffers import BufferDescription, StageBuffers, Workspace
 from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.opencl.structs import SHADOW_CELLS
-from server.shading.kept_shadows import NO_TURN, TURNS, KeptShadows, ShadowCause
+from server.shading.kept_shadows import LONGEST, KeptShadows, ShadowCause
 from server.shading.traced_scene import TracedScene
 from server.transfer.sample_grid import SampleGrid, grid_of
 
@@ -35,6 +35,9 @@ class ShadowTable(StageBuffers):
 
     places_a_sample: ClassVar[float]
     """Size of the table, in samples of a frame, rounded up to a power of two; 32 bytes each."""
+
+    close: ClassVar[float]
+    """A value that differs by more from the one before has changed."""
 
     table = BufferDescription(np.uint32)
     """[places, WORDS] as in kept_shadows.clh."""
@@ -61,12 +64,15 @@ class RealShadows(ShadowTable):
     """R' / R of real surface."""
 
     places_a_sample = 4
+    close = 0.02
 
 
 class VirtualOcclusions(ShadowTable):
-    """Radiance that occluders take from virtual surface, which fills a part of a picture."""
+    """Radiance that occluders take from virtual surface, which fills a part of a picture; over the light's mean. A sample
+    traces few directions: with .02 in place of .05 half as many again would seem to change."""
 
     places_a_sample = 1
+    close = 0.05
 
 
 @dataclass(frozen=True)
@@ -80,23 +86,21 @@ class ShadowCells:
     asked: cl_array.Array
     found: cl_array.Array
     now: int
-    """Number of this frame, from 1; 0 where nothing is filled."""
+    """Number of this frame, from 1; 0 where no cell is filled."""
 
     def arguments(self) -> tuple[KernelArgument, ...]:
         """SHADOW_CELLS of kept_shadows.clh."""
         return self.parameters, self.table
 
-    def keep(
-        self, engine: Engine, camera: CameraModel, samples: SampleGrid, around: PixelBox, found: cl_array.Array
-    ) -> None:
-        """Keep what was found at the samples `around`, in a kernel before; found: [rows, cols] float4."""
+    def keep(self, engine: Engine, camera: CameraModel, samples: SampleGrid, around: PixelBox) -> None:
+        """Keep what a kernel before found at the samples `around`."""
         engine.launch(
             engine.kernel("shading/kept_shadows.cl", "keep_shadows"),
             (around[2] - around[0], around[3] - around[1]),
             grid_of(samples, camera),
             int4(*around),
             self.now,
-            found,
+            self.found,
             self.asked,
             self.table,
         )
@@ -116,7 +120,7 @@ def shadow_cells(
     """The cells for a frame's `samples`.
 
     eye: [3] where the camera is, volume metres. level: of the light's radiance, where values are radiance. fills: the
-    frame's number and turn go on; else what is kept is only looked up.
+    frame's number goes on; else what is kept is only looked up.
     """
     table, count = engine.buffers(kind), samples.rows * samples.cols
     table.reserve(engine, count)
@@ -129,8 +133,9 @@ def shadow_cells(
         level=max(level, float(np.finfo(np.float32).tiny)),
         places=table.places,
         since=since,
-        turns=TURNS,
-        turn=now % TURNS if fills else NO_TURN,
+        turns=LONGEST,
+        close=table.close,
+        now=now,
     )
     shape = (samples.rows, samples.cols)
     by_sample = table.asked.array(shape), table.found.array(shape)
@@ -142,7 +147,9 @@ def no_cells(engine: Engine) -> tuple[KernelArgument, ...]:
     return _NOTHING, engine.unused
 
 
-_NOTHING = SHADOW_CELLS(eye=float4(0, 0, 0, 0), spacing=1.0, level=1.0, places=0, since=0, turns=TURNS, turn=NO_TURN)
+_NOTHING = SHADOW_CELLS(
+    eye=float4(0, 0, 0, 0), spacing=1.0, level=1.0, close=0.0, places=0, now=0, since=0, turns=LONGEST
+)
 
 
 def places_for(count: int) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -13,13 +12,13 @@ from protocol.frames import CameraModel
 from server.objects.rasterize import Placed, VirtualSurface
 from server.opencl.engine import Engine
 from server.shading.differential_rendering import VIRTUAL_STRIDE, shadow_real, shadow_virtual
-from server.shading.kept_shadows import STEADY, TURNS, KeptShadows, ShadowCause, SplitSh, light_difference
+from server.shading.kept_shadows import LONGEST, STEADY, KeptShadows, ShadowCause, SplitSh, light_difference
 from server.shading.shadow_cells import RealShadows, VirtualOcclusions, places_for
 from server.shading.traced_scene import TracedScene, trace_scene, upload_light
 from server.transfer.radiance_transfer import Transfer, direction_sets, transfer_radiance
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
-from tests.reference.kept_shadows import shadow_cell_of
+from tests.reference.kept_shadows import KeptTable, shadow_cell_of
 from tests.scenes import lights
 from tests.scenes.analytic import Floats
 from tests.scenes.shaded_floor import (
@@ -86,35 +85,6 @@ def test_a_rest_that_changes_beside_bright_discs_is_another_light() -> None:
     assert light_difference(split(LIGHT), split(LIGHT, faint)) == pytest.approx(1e-3, rel=0.01)
 
 
-class Cells(NamedTuple):
-    """[side, side] each."""
-
-    first: NDArray[np.int64]
-    """The first sample in each sample's cell."""
-    place: NDArray[np.int64]
-
-    @staticmethod
-    def of(points: Floats, normals: Floats, which: NDArray[np.int_], eye: Floats, spacing: float, places: int) -> Cells:
-        """points, normals: [n, 3]; which: [n] as of shadow_cell_of."""
-        firsts: dict[tuple[int, int], int] = {}
-        keyed = [
-            shadow_cell_of(point, normal, int(thing), eye, spacing, places)
-            for point, normal, thing in zip(points, normals, which, strict=True)
-        ]
-        first = np.array([firsts.setdefault(key, i) for i, (key, _) in enumerate(keyed)])
-        side = round(len(points) ** 0.5)
-        assert len({place for _, place in keyed}) == len(firsts)  # no two cells have one place
-        return Cells(first.reshape(side, side), np.array([place for _, place in keyed]).reshape(side, side))
-
-    def shared(self, values: Floats) -> Floats:
-        """[side, side, n] as the first sample of each cell has them."""
-        return np.asarray(values.reshape(-1, values.shape[-1])[self.first])
-
-    def have_turn(self, now: int) -> NDArray[np.bool_]:
-        """[side, side, 1]."""
-        return (self.place % TURNS == now % TURNS)[..., None]
-
-
 @dataclass(frozen=True)
 class Stage:
     """A floor, and a plate above it that is not real."""
@@ -149,11 +119,12 @@ class Stage:
         found = shadow_real(engine, self.camera, self.surface, self.transfer, scene, step=step, eye=eye)
         return download4(engine, found.values).astype(float)
 
-    def cells(self, eye: Floats) -> Cells:
-        """Of all samples."""
-        spacing, places = STRIDE / self.camera.fx, places_for(RealShadows.places_a_sample * SIDE * SIDE)
+    def twin(self) -> KeptTable:
+        """Of all samples, seen from EYE."""
+        spacing, places = STRIDE / self.camera.fx, places_for(int(RealShadows.places_a_sample * SIDE * SIDE))
         points = floor_points(side=SIDE).astype(np.float32).astype(float)
-        return Cells.of(points, np.broadcast_to(UP, points.shape), np.full(SIDE * SIDE, -1), eye, spacing, places)
+        cells = [shadow_cell_of(point, UP, -1, EYE, spacing, places) for point in points]
+        return KeptTable(cells, RealShadows.close, LONGEST)
 
 
 def test_what_shadows_are_of_is_remembered(engine: Engine) -> None:
@@ -195,62 +166,45 @@ def test_shadows_of_other_rays_or_another_scan_are_others(engine: Engine) -> Non
 # ---- shadows on real surface ---------------------------------------------------------------------------------------
 
 
-def test_shadows_are_kept_while_they_are_true(engine: Engine) -> None:
+@pytest.mark.parametrize("places_a_sample", [512, 0.1])
+def test_shadows_are_kept_as_by_the_twin(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, places_a_sample: float
+) -> None:
+    """Steady light, a level that rises, light that moves a little, and much; with few places cells share them."""
+    monkeypatch.setattr(RealShadows, "places_a_sample", places_a_sample)
     stage = Stage.of(engine)
-    cells = stage.cells(EYE)
-    exact = stage.ratio(LIGHT, None)
-    assert 0.05 < (exact[..., 0] < 0.9).mean() < 0.95
-    assert SIDE < len(np.unique(cells.first)) < 0.8 * SIDE * SIDE
-    assert np.abs(exact - cells.shared(exact)).max() > 0.02
-    np.testing.assert_array_equal(stage.ratio(LIGHT, EYE), exact)
+    twin, nearly, other = stage.twin(), LIGHT + STEADILY, lights.lobe_and_sky((-0.6, 0.7, 0.2))
+    keys, places = {key for key, _ in twin.cells}, {place for _, place in twin.cells}
+    assert SIDE < len(keys) < 0.8 * SIDE * SIDE
+    assert (len(places) == len(keys)) == (places_a_sample == 512)
+    exact = {id(light): stage.ratio(light, None)[..., :3].reshape(-1, 3) for light in (LIGHT, nearly, other)}
+    assert 0.05 < (exact[id(LIGHT)][:, 0] < 0.9).mean() < 0.95
+    assert np.abs(exact[id(nearly)] - exact[id(LIGHT)]).max() > 1e-3
+    assert np.abs(exact[id(other)] - exact[id(LIGHT)]).max() > 0.05
 
-    np.testing.assert_array_equal(stage.ratio(LIGHT, EYE), np.where(cells.have_turn(2), exact, cells.shared(exact)))
-    brighter = stage.ratio(2 * LIGHT, None)
-    np.testing.assert_array_equal(
-        stage.ratio(2 * LIGHT, EYE), np.where(cells.have_turn(3), brighter, cells.shared(exact))
-    )
-    before = stage.ratio(LIGHT, EYE, step=2)  # for the objects' own light: none is found anew, none kept
-    np.testing.assert_allclose(before[::2, ::2], cells.shared(exact)[::2, ::2], atol=1e-6)
-    nearly = LIGHT + STEADILY
-    others = stage.ratio(nearly, None)
-    assert np.abs(others - exact).max() > 1e-3
-    found = stage.ratio(nearly, EYE)
-    np.testing.assert_allclose(found, np.where(cells.have_turn(4), others, cells.shared(exact)), atol=1e-6)
-    now_there = np.where(cells.have_turn(4), cells.shared(others), cells.shared(exact))
-    np.testing.assert_allclose(stage.ratio(nearly, EYE), np.where(cells.have_turn(5), others, now_there), atol=1e-6)
+    shares, since = [], 1
+    for number, light in enumerate([LIGHT] * 20 + [nearly] * 4 + [other] * 12, 1):
+        since = number if number in (1, 25) else since
+        level = 2.0 if number > 10 else 1.0
+        found = stage.ratio(level * light, EYE)
+        np.testing.assert_array_equal(found[..., 3], 1)
+        expected = twin.step(exact[id(light)], since)
+        np.testing.assert_allclose(found[..., :3].reshape(-1, 3), expected, atol=3e-6)
+        shares.append(twin.anew / SIDE**2)
+        if number in (12, 30):  # for the objects' own light: nothing is found anew that is true, nothing kept
+            blocks = stage.ratio(level * light, EYE, step=2)[::2, ::2, :3]
+            known = twin.look_up(exact[id(light)]).reshape(SIDE, SIDE, 3)[::2, ::2]
+            np.testing.assert_allclose(blocks, known, atol=3e-6)
+    assert shares[0] == shares[24] == 1
+    if places_a_sample == 512:
+        assert np.mean(shares[12:20]) < 0.5
 
 
-@pytest.mark.parametrize("what", ["light", "object"])
-def test_shadows_are_found_anew_when_they_are_others(engine: Engine, what: str) -> None:
+def test_shadows_of_a_thing_that_moves_are_found_anew(engine: Engine) -> None:
     stage = Stage.of(engine)
-    light = lights.lobe_and_sky((-0.6, 0.7, 0.2)) if what == "light" else LIGHT
-    objects = [stage.moved()] if what == "object" else None
-    exact = stage.ratio(light, None, objects)
+    exact = stage.ratio(LIGHT, None, [stage.moved()])
     assert np.abs(exact - stage.ratio(LIGHT, EYE)).max() > 0.05
-    np.testing.assert_array_equal(stage.ratio(light, EYE, objects), exact)
-    now = engine.buffers(RealShadows).memory.now + 1
-    cells = stage.cells(EYE)
-    np.testing.assert_array_equal(
-        stage.ratio(light, EYE, objects), np.where(cells.have_turn(now), exact, cells.shared(exact))
-    )
-
-
-def test_cells_that_ask_for_one_place_do_not_mix(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = Stage.of(engine)
-    exact, cells = stage.ratio(LIGHT, None), stage.cells(EYE)
-    monkeypatch.setattr(RealShadows, "places_a_sample", 0.1)
-    for _ in range(3):
-        found = stage.ratio(LIGHT, EYE)
-    assert (found != exact).any()
-    assert _is_of_another_of_its_cell(found, exact, cells).all()
-
-
-def _is_of_another_of_its_cell(found: Floats, exact: Floats, cells: Cells) -> NDArray[np.bool_]:
-    """Where a sample has what any in its cell found: another one may have filled it."""
-    mine = cells.first.ravel()
-    same = mine[:, None] == mine[None]
-    equal = (found.reshape(-1, 1, 4) == exact.reshape(1, -1, 4)).all(-1)
-    return np.asarray((same & equal).any(1).reshape(cells.first.shape))
+    np.testing.assert_array_equal(stage.ratio(LIGHT, EYE, [stage.moved()]), exact)
 
 
 def test_a_picture_of_another_size_begins_anew(engine: Engine) -> None:
@@ -320,27 +274,32 @@ class Top:
         found = shadow_virtual(self.engine, self.camera, self.surface, scene, eye)
         return download4(self.engine, found.values).astype(float)
 
-    def cells(self, eye: Floats) -> Cells:
-        """Of all samples."""
-        spacing, places = VIRTUAL_STRIDE / self.camera.fx, places_for(VirtualOcclusions.places_a_sample * COUNT * COUNT)
+    def twin(self) -> KeptTable:
+        """Of all samples, seen from EYE."""
+        samples = VirtualOcclusions.places_a_sample * COUNT * COUNT
+        spacing, places = VIRTUAL_STRIDE / self.camera.fx, places_for(int(samples))
         points = self.points.reshape(-1, 3).astype(np.float32).astype(float)
-        return Cells.of(points, self.normals.reshape(-1, 3), self.which.ravel(), eye, spacing, places)
+        each = zip(points, self.normals.reshape(-1, 3), self.which.ravel(), strict=True)
+        cells = [shadow_cell_of(point, normal, int(which), EYE, spacing, places) for point, normal, which in each]
+        return KeptTable(cells, VirtualOcclusions.close, LONGEST)
 
 
-def test_occlusion_is_kept_by_cell(engine: Engine) -> None:
+def test_occlusion_is_kept_as_by_the_twin(engine: Engine) -> None:
+    """Of two objects, with normals of two kinds; relative to the light's level."""
     top = Top.of(engine)
-    exact, cells = top.taken(LIGHT, None), top.cells(EYE)
-    assert 40 < len(np.unique(cells.first)) < 300
-    np.testing.assert_array_equal(top.taken(LIGHT, EYE), exact)
-
-    before = cells.shared(exact)
-    assert np.abs(before - exact).max() > 0.01
-    assert 0.03 < cells.have_turn(2).mean() < 0.3
-    mean = np.where(cells.have_turn(2), (before + exact) / 2, before)
-    np.testing.assert_allclose(top.taken(LIGHT, EYE), mean, atol=1e-6)
-    kept = cells.shared(mean)
-    again = np.where(cells.have_turn(3), (kept + exact) / 2, kept)
-    np.testing.assert_allclose(top.taken(2 * LIGHT, EYE), again * [2, 2, 2, 1], atol=2e-6)
+    twin, exact = top.twin(), top.taken(LIGHT, None)
+    level = np.maximum(0.5 / np.sqrt(np.pi) * LIGHT[0], 0.0).mean()
+    keys = [key for key, _ in twin.cells]
+    assert 40 < len(set(keys)) < 300
+    assert len({place for _, place in twin.cells}) == len(set(keys))
+    assert len({(key, which) for key, which in zip(keys, top.which.ravel(), strict=True)}) == len(set(keys))
+    for number in range(1, 16):
+        brightness = 1.0 if number < 8 else 3.0
+        expected = level * twin.step(exact[..., :3].reshape(-1, 3) / level, 1)
+        found = top.taken(brightness * LIGHT, EYE)
+        np.testing.assert_array_equal(found[..., 3], 1)
+        np.testing.assert_allclose(found[..., :3].reshape(-1, 3), brightness * expected, atol=2e-5)
+    assert 0 < twin.anew < 0.7 * len(keys)
 
 
 def test_another_light_is_seen_at_once(engine: Engine) -> None:
@@ -350,26 +309,3 @@ def test_another_light_is_seen_at_once(engine: Engine) -> None:
     np.testing.assert_array_equal(top.taken(other, EYE), exact)
     moved = replace(top, objects=[top.objects[0], (top.objects[1][0], top.objects[1][1] + 0.01 * np.eye(4, 4, 3))])
     np.testing.assert_array_equal(moved.taken(other, EYE), moved.taken(other, None))
-
-
-def test_what_is_kept_of_a_cell_comes_to_all_its_directions(engine: Engine) -> None:
-    """Samples differ by their few directions. The mean of what a cell's samples found is nearer to all directions."""
-    top, light = Top.of(engine), lights.uniform()
-    first = top.cells(EYE).first
-    alone = top.taken(light, None)[..., 0]
-    for _ in range(4 * TURNS):
-        kept = top.taken(light, EYE)[..., 0]
-    dense = _dense(top, light)
-    has_others = np.array([(first == f).sum() > 1 for f in first.ravel()]).reshape(first.shape)
-    errors = [float(np.sqrt(np.mean((found - dense)[has_others] ** 2))) for found in (alone, kept)]
-    assert errors[1] < 1.1 * errors[0]  # seen: .038 and .037; cells here are as wide as the samples' distance
-
-
-def _dense(top: Top, light: Floats) -> Floats:
-    """[COUNT, COUNT] by a thousand directions."""
-    rays = direction_sets(1024, 4)
-    on_device = upload_light(top.engine, light, rays)
-    scene = trace_scene(top.engine, top.volume, on_device, rays, FAR_M, top.objects)
-    return download4(top.engine, shadow_virtual(top.engine, top.camera, top.surface, scene).values)[..., 0].astype(
-        float
-    )

@@ -1,6 +1,8 @@
-"""Twin of shadow_cell in kept_shadows.clh, in plain integers."""
+"""Twin of include/kept_shadows.clh: cells in plain integers, and a table of what is kept in them in float64."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,3 +21,61 @@ def shadow_cell_of(
     own = 0 if which < 0 else 1 + ((which * FACINGS + z) * FACINGS + y) * FACINGS + x
     key = cell.key[0], cell.key[1] ^ mixed(own)
     return key, mixed(key[0] ^ mixed(key[1])) & (places - 1)
+
+
+@dataclass
+class Entry:
+    """What is kept of one cell."""
+
+    key: tuple[int, int]
+    frame: int
+    value: Floats
+    lasts: int
+
+
+@dataclass
+class KeptTable:
+    """One table; cells: key and place of each sample."""
+
+    cells: list[tuple[tuple[int, int], int]]
+    close: float
+    longest: int
+    entries: dict[int, Entry] = field(default_factory=dict)
+    now: int = 0
+    anew: int = 0
+    """Samples of the last frame that were found anew."""
+
+    def step(self, own: Floats, since: int) -> Floats:
+        """[n, 3] what is shown in the next frame, in which samples would find `own`; since: see kept_shadows.py."""
+        self.now += 1
+        shown, asked = own.copy(), dict[int, Entry]()
+        self.anew = 0
+        for i, (key, place) in enumerate(self.cells):
+            entry = self.entries.get(place)
+            entry = entry if entry is not None and entry.key == key else None
+            is_true = entry is not None and entry.frame >= since
+            if entry is not None and is_true and not self._is_due(entry, place):
+                shown[i] = entry.value
+                continue
+            self.anew += 1
+            value, lasts = own[i], entry.lasts if entry is not None else 1
+            if entry is not None and is_true:
+                is_same = np.abs(own[i] - entry.value).max() <= self.close
+                value = (own[i] + entry.value) / 2 if is_same else own[i]
+                lasts = min(2 * entry.lasts, self.longest) if is_same else max(entry.lasts // 2, 1)
+            shown[i] = value
+            asked.setdefault(place, Entry(key, self.now, value, lasts))
+        self.entries |= asked
+        return shown
+
+    def look_up(self, own: Floats) -> Floats:
+        """[n, 3] what is shown where all that is kept is true, and nothing is filled."""
+        found = [self.entries.get(place) for _, place in self.cells]
+        return np.array(
+            [e.value if e and e.key == key else mine for e, (key, _), mine in zip(found, self.cells, own, strict=True)]
+        )
+
+    def _is_due(self, entry: Entry, place: int) -> bool:
+        if entry.lasts < self.longest:
+            return self.now - entry.frame >= entry.lasts
+        return place % self.longest == self.now % self.longest

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,12 +32,13 @@ class GallerySource:
     has_poses = True
     up: tuple[float, float, float] | None = (0.0, 1.0, 0.0)
 
-    def __init__(self, name: str, width: int = WIDTH) -> None:
-        """Raises SourceError for an unknown name."""
+    def __init__(self, name: str, width: int = WIDTH, frames: int | None = None) -> None:
+        """frames: None: as many as the scene has. Raises SourceError for an unknown name."""
         if name not in GALLERY:
             raise SourceError(f"{PREFIX}{name}: there is no such scene; there are {', '.join(GALLERY)}")
         self.name = f"{PREFIX}{name}"
-        self.scene: GalleryScene = GALLERY[name]
+        scene = GALLERY[name]
+        self.scene: GalleryScene = scene if frames is None else replace(scene, frames=frames)
         focal, height = FOCAL_OF_WIDTH * width, width * HEIGHT // WIDTH
         self.camera = CameraModel(
             width=width, height=height, fx=focal, fy=focal, cx=(width - 1) / 2, cy=(height - 1) / 2

@@ -68,8 +68,10 @@ class RealShadows(ShadowTable):
 
 
 class VirtualOcclusions(ShadowTable):
-    """Radiance that occluders take from virtual surface, which fills a part of a picture; over the light's mean. A sample
-    traces few directions: with .02 in place of .05 half as many again would seem to change."""
+    """Radiance that occluders take from virtual surface, which fills a part of a picture; over the light's mean.
+
+    A sample traces few directions: with .02 in place of .05 half as many again would seem to change.
+    """
 
     places_a_sample = 1
     close = 0.05

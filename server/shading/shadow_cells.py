@@ -64,13 +64,13 @@ class RealShadows(ShadowTable):
     """R' / R of real surface."""
 
     places_a_sample = 4
-    close = 0.02
+    close = 0.01
 
 
 class VirtualOcclusions(ShadowTable):
     """Radiance that occluders take from virtual surface, which fills a part of a picture; over the light's mean.
 
-    A sample traces few directions: with .02 in place of .05 half as many again would seem to change.
+    A sample traces few directions: with .02 in place of .05 half as many again would seem to have changed.
     """
 
     places_a_sample = 1

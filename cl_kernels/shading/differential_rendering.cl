@@ -151,7 +151,8 @@ kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, const int most,
 // positions, normals [h][w] (w = 1 where covered), shown [h][w] (which object, -1 none): the virtual geometry buffer.
 // scene.every: a sample traces every n-th direction of its set; its neighbours trace others. -> occluded [rows][cols] (rgb, w = 1 valid)
 // at the samples `around` (x0 y0 x1 y1, half-open).
-// Samples whose cell keeps what is taken, over cells.level, get that; the others ask to fill it. -> found, asked: as in shadow_real.
+// Samples whose cell keeps what is taken, over cells.level, get that; the others ask to fill it, in each frame with the next part of
+// their directions. -> found, asked: as in shadow_real.
 kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const float4 *positions, global const float4 *normals, global const int *shown,
                            SHADOW_CELLS, global int4 *asked, global float4 *found, global float4 *occluded) {
     SHARED_PARTS
@@ -169,7 +170,7 @@ kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const flo
         const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
         const Arriving arrives = ARRIVING_OF_SCENE(place_of_object(scene.light.table, light_table, shown[pixel]));
         own = taken_from_virtual(volume, things, arrives, position, normal.xyz, direction_set(row, col),
-                                 direction_subset(row, col + cells.now, every) + every * sharer, every * SHARERS);
+                                 direction_subset(row, col + max(cells.now - 1, 0), every) + every * sharer, every * SHARERS);
     }
     const float4 taken = SUM_OF_SHARERS(own) / SHARERS;
     if (!(is_inside & (sharer == 0))) return;

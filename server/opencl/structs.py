@@ -189,8 +189,8 @@ SHADOW_CELLS = Struct(
 )
 """A table of kept_shadows.clh. eye, spacing: as in TransferCacheParameters; level: of the light's radiance, which
 values are relative to; close: values that differ by no more are the same; places: 0 where nothing is kept; now: this
-frame's number, 0 where all that is true is used; since: what was found in this frame or later is true; turns: frames
-after which a value is found anew at the latest."""
+frame's number; since: what was found in this frame or later is true; turns: frames after which a value is found anew at
+the latest."""
 
 LOOK_UP_PARAMETERS = Struct(
     "LookUpParameters",

@@ -88,7 +88,7 @@ class ShadowCells:
     asked: cl_array.Array
     found: cl_array.Array
     now: int
-    """Number of this frame, from 1; 0 where no cell is filled."""
+    """Number of this frame, from 1."""
 
     def arguments(self) -> tuple[KernelArgument, ...]:
         """SHADOW_CELLS of kept_shadows.clh."""
@@ -121,14 +121,14 @@ def shadow_cells(
 ) -> ShadowCells:
     """The cells for a frame's `samples`.
 
-    eye: [3] where the camera is, volume metres. level: of the light's radiance, where values are radiance. fills: the
-    frame's number goes on; else what is kept is only looked up.
+    eye: [3] where the camera is, volume metres. level: of the light's radiance, where values are radiance. fills: what is
+    found is kept, and the next call is of the next frame; else of the same.
     """
     table, count = engine.buffers(kind), samples.rows * samples.cols
     table.reserve(engine, count)
     cause = ShadowCause.of(scene)
     since = table.memory.since(cause)
-    now = table.memory.begin_frame(cause) if fills else 0
+    now = table.memory.begin_frame(cause) if fills else table.memory.now + 1
     parameters = SHADOW_CELLS(
         eye=float4(*eye, 0.0),
         spacing=samples.stride / camera.fx,

@@ -45,8 +45,9 @@ class KeptTable:
     anew: int = 0
     """Samples of the last frame that were found anew."""
 
-    def step(self, own: Floats, since: int) -> Floats:
-        """[n, 3] what is shown in the next frame, in which samples would find `own`; since: see kept_shadows.py."""
+    def step(self, own: Floats, since: int, *, fills: bool = True) -> Floats:
+        """[n, 3] what is shown in the next frame, in which samples would find `own`; since: see kept_shadows.py. fills:
+        what is found is kept; else the frame is still to come."""
         self.now += 1
         shown, asked = own.copy(), dict[int, Entry]()
         self.anew = 0
@@ -65,15 +66,11 @@ class KeptTable:
                 lasts = min(2 * entry.lasts, self.longest) if is_same else max(entry.lasts // 2, 1)
             shown[i] = value
             asked.setdefault(place, Entry(key, self.now, value, lasts))
-        self.entries |= asked
+        if fills:
+            self.entries |= asked
+        else:
+            self.now -= 1
         return shown
-
-    def look_up(self, own: Floats) -> Floats:
-        """[n, 3] what is shown where all that is kept is true, and nothing is filled."""
-        found = [self.entries.get(place) for _, place in self.cells]
-        return np.array(
-            [e.value if e and e.key == key else mine for e, (key, _), mine in zip(found, self.cells, own, strict=True)]
-        )
 
     def _is_due(self, entry: Entry, place: int) -> bool:
         if entry.lasts < self.longest:

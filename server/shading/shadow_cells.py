@@ -121,8 +121,8 @@ def shadow_cells(
 ) -> ShadowCells:
     """The cells for a frame's `samples`.
 
-    eye: [3] where the camera is, volume metres. level: of the light's radiance, where values are radiance. fills: what is
-    found is kept, and the next call is of the next frame; else of the same.
+    eye: [3] where the camera is, volume metres. level: of the light's radiance, where values are radiance. fills: what
+    is found is kept, and the next call is of the next frame; else of the same.
     """
     table, count = engine.buffers(kind), samples.rows * samples.cols
     table.reserve(engine, count)

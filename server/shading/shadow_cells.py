@@ -50,14 +50,16 @@ class ShadowTable(StageBuffers):
         super().__init__(workspace)
         self.memory: KeptShadows = KeptShadows()
         self.places = 0
+        self.is_whole = True
+        """Whether no frame was given up between its claims and what it keeps."""
 
     def reserve(self, engine: Engine, samples: int) -> None:
-        """Room for the cells of so many samples; what was kept for another number is forgotten."""
+        """Room for the cells of so many samples; what was kept for another number, or by halves, is forgotten."""
         places = places_for(int(self.places_a_sample * samples))
-        if places != self.places:
+        if places != self.places or not self.is_whole:
             kernel = engine.kernel("shading/kept_shadows.cl", "begin_shadows")
             engine.launch(kernel, (places,), places, self.table.array((places, WORDS)))
-            self.places = places
+            self.places, self.is_whole = places, True
 
 
 class RealShadows(ShadowTable):
@@ -89,6 +91,7 @@ class ShadowCells:
     found: cl_array.Array
     now: int
     """Number of this frame, from 1."""
+    of: ShadowTable
 
     def arguments(self) -> tuple[KernelArgument, ...]:
         """SHADOW_CELLS of kept_shadows.clh."""
@@ -106,6 +109,7 @@ class ShadowCells:
             self.asked,
             self.table,
         )
+        self.of.is_whole = True
 
 
 def shadow_cells(
@@ -141,7 +145,8 @@ def shadow_cells(
     )
     shape = (samples.rows, samples.cols)
     by_sample = table.asked.array(shape), table.found.array(shape)
-    return ShadowCells(parameters, table.table.array((table.places, WORDS)), *by_sample, now)
+    table.is_whole = not fills  # until what was found is kept
+    return ShadowCells(parameters, table.table.array((table.places, WORDS)), *by_sample, now, table)
 
 
 def no_cells(engine: Engine) -> tuple[KernelArgument, ...]:

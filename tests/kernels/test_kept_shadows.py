@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from server.objects.rasterize import Placed, VirtualSurface
 from server.opencl.engine import Engine
 from server.shading.differential_rendering import VIRTUAL_STRIDE, shadow_real, shadow_virtual
 from server.shading.kept_shadows import LONGEST, STEADY, KeptShadows, ShadowCause, SplitSh, light_difference
-from server.shading.shadow_cells import RealShadows, VirtualOcclusions, places_for
+from server.shading.shadow_cells import RealShadows, ShadowCells, VirtualOcclusions, places_for
 from server.shading.traced_scene import TracedScene, trace_scene, upload_light
 from server.transfer.radiance_transfer import Transfer, direction_sets, transfer_radiance
 from server.volume.raycast import Surface
@@ -205,6 +206,19 @@ def test_shadows_of_a_thing_that_moves_are_found_anew(engine: Engine) -> None:
     exact = stage.ratio(LIGHT, None, [stage.moved()])
     assert np.abs(exact - stage.ratio(LIGHT, EYE)).max() > 0.05
     np.testing.assert_array_equal(stage.ratio(LIGHT, EYE, [stage.moved()]), exact)
+
+
+def test_a_frame_that_was_given_up_leaves_no_claims(engine: Engine) -> None:
+    stage = Stage.of(engine)
+    exact = stage.ratio(LIGHT, None)
+    with patch.object(ShadowCells, "keep", side_effect=ArithmeticError), pytest.raises(ArithmeticError):
+        stage.ratio(LIGHT, EYE)
+    twin = stage.twin()
+    twin.now = engine.buffers(RealShadows).memory.now
+    for _ in range(5):
+        found = stage.ratio(LIGHT, EYE)[..., :3].reshape(-1, 3)
+        np.testing.assert_allclose(found, twin.step(exact[..., :3].reshape(-1, 3), 1), atol=3e-6)
+    assert twin.anew < 0.2 * SIDE**2
 
 
 def test_a_picture_of_another_size_begins_anew(engine: Engine) -> None:

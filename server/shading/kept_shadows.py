@@ -23,8 +23,8 @@ from server.transfer.radiance_transfer import Directions
 from server.volume.volume import Volume
 
 LONGEST = 8
-"""Frames after which a value is found anew at the latest; a power of two. Half of those after which transfer is traced
-again for the first time."""
+"""Frames after which a value in view is found anew at the latest; a power of two. Half of those after which transfer is
+traced again for the first time."""
 STEADY = 0.05
 """How much the light may differ from the one that a shadow was found under, as a share of its coefficients' norm at the
 same level: so much of a shadow's depth, in the mean over directions. A solution of the real kitchen moves its light by
@@ -32,7 +32,7 @@ same level: so much of a shadow's depth, in the mean over directions. A solution
 object, by FLIP .0021 with and without kept shadows."""
 SHADOWS_OF_KNOWN_PLACES = LeftOut(
     effect="shadows_of_known_places",
-    reason=f"found at the same place in the last {LONGEST} frames, under a light that differs by {STEADY:.0%} at most",
+    reason=f"kept at the same place, under a light that is the same to {STEADY:.0%}; in view, {LONGEST} frames at most",
     error_bound=None,
 )
 _REMEMBERED = 80

@@ -198,7 +198,9 @@ class Pipeline:
             smooth_edges=settings.edges == "smooth",
             restores_clipped=not settings.as_thesis,
             waits_for_light=waits_for_light,
-            follows_light=not settings.has_caches or reuse.reason is not None,
+            follows_light=not settings.has_caches
+            or reuse.reason is not None
+            or (reuse.is_checkpoint and reuse.is_still),
         )
 
     def _sample_transfer(

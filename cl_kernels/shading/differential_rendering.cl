@@ -72,6 +72,7 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
     const float3 taken = SUM_OF_SHARERS(own_part).xyz / SHARERS;
     if (!(is_inside & (sharer == 0))) return;
     float4 of_ratio = (float4)(0.0f), of_shaded = (float4)(0.0f);
+    uint number = 0;
     if (is_known) {
         global const float4 *light = coefficients_of(scene.light.table, light_table, place);
         float3 without = (float3)(0.0f);
@@ -79,13 +80,12 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
         without = shading_without(arrives, without, openness[sample], hits[sample]);
         const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
         const float3 own = fmax(without - taken, floor) / fmax(without, floor);
-        const float4 value = cell.is_kept ? cell.value : with_found(cells, cell, own);
-        of_ratio = (float4)(value.xyz, 1.0f);
-        if (asking) found[sample] = value;
+        of_ratio = (float4)(cell.is_kept ? cell.value.xyz : with_found(cells, cell, own, sample, &number), 1.0f);
+        if (asking) found[sample] = of_ratio;
         of_shaded = (float4)(without, 1.0f);
     }
     if (!is_known) cell.place = -1;
-    if (asking) ask_to_keep(cell, sample, table, asked);
+    if (asking) ask_to_keep(cell, number, sample, table, asked);
     write_block(grid, positions, normals, row, col, step, of_ratio, of_shaded, ratio, shaded, has_discs, least, without_discs, with_discs,
                 whole, whole_shaded);
 }
@@ -176,10 +176,11 @@ kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const flo
     if (!(is_inside & (sharer == 0))) return;
     occluded[sample] = taken;
     if (cells.places == 0) return;
-    const float4 value = cell.is_kept ? cell.value : with_found(cells, cell, taken.xyz / cells.level);
-    if (cell.is_true) occluded[sample] = (float4)(cells.level * value.xyz, 1.0f);
-    found[sample] = value;
-    ask_to_keep(cell, sample, table, asked);
+    uint number = 0;
+    const float3 value = cell.is_kept ? cell.value.xyz : with_found(cells, cell, taken.xyz / cells.level, sample, &number);
+    if (cell.is_true) occluded[sample] = (float4)(cells.level * value, 1.0f);
+    found[sample] = (float4)(value, 0.0f);
+    ask_to_keep(cell, number, sample, table, asked);
 }
 
 // Radiance of points on virtual objects. points, normals (volume space), albedos [points_count] -> radiances [points_count] (rgb).

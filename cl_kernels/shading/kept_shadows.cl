@@ -10,11 +10,10 @@ kernel void begin_shadows(const int places, global uint *table) {
 }
 
 // What samples found who asked to fill a cell, those `around` (x0 y0 x1 y1, half-open) of [rows][cols], is kept there.
-kernel void keep_shadows(const Grid grid, const int4 around, const int now, global const float4 *found, global const int4 *asked,
-                         global uint *table) {
+kernel void keep_shadows(const Grid grid, const int4 around, SHADOW_CELLS, global const int4 *asked, global const float4 *found) {
     const int col = around.x + get_global_id(0);
     const int row = around.y + get_global_id(1);
     if (col >= around.z || row >= around.w) return;
     const int sample = row * grid.cols + col;
-    keep_shadow(sample, now, asked[sample], found[sample], table);
+    keep_shadow(cells, asked[sample], found[sample].xyz, table);
 }

@@ -4,7 +4,9 @@ One is of the shadows on real surface, one of what occluders take from virtual s
 kept_shadows.py says. Kernels: keep_shadows of kept_shadows.cl; include/kept_shadows.clh.
 
 A table is a hash of cells, with one place for each: of two cells that ask for the same place, the one that asked last
-has it. The first of a frame's samples in a cell fills it, whatever the order in which work-items run.
+has it. Of a frame's samples in a cell one fills it, whatever the order in which work-items run: the first, or the first
+that differs from what was kept. Where samples of a cell differ, what is kept is found anew in each frame, by all of
+them: at the foot of a thing shadows are as sharp as without.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ class ShadowTable(StageBuffers):
     """Size of the table, in samples of a frame, rounded up to a power of two; 32 bytes each."""
 
     close: ClassVar[float]
-    """A value that differs by more from the one before has changed."""
+    """A value that differs by more from the one that was kept is another."""
 
     table = BufferDescription(np.uint32)
     """[places, WORDS] as in kept_shadows.clh."""
@@ -89,8 +91,6 @@ class ShadowCells:
     """[places, WORDS]."""
     asked: cl_array.Array
     found: cl_array.Array
-    now: int
-    """Number of this frame, from 1."""
     of: ShadowTable
 
     def arguments(self) -> tuple[KernelArgument, ...]:
@@ -104,10 +104,9 @@ class ShadowCells:
             (around[2] - around[0], around[3] - around[1]),
             grid_of(samples, camera),
             int4(*around),
-            self.now,
-            self.found,
+            *self.arguments(),
             self.asked,
-            self.table,
+            self.found,
         )
         self.of.is_whole = True
 
@@ -146,7 +145,7 @@ def shadow_cells(
     shape = (samples.rows, samples.cols)
     by_sample = table.asked.array(shape), table.found.array(shape)
     table.is_whole = not fills  # until what was found is kept
-    return ShadowCells(parameters, table.table.array((table.places, WORDS)), *by_sample, now, table)
+    return ShadowCells(parameters, table.table.array((table.places, WORDS)), *by_sample, table)
 
 
 def no_cells(engine: Engine) -> tuple[KernelArgument, ...]:

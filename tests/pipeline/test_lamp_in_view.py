@@ -77,4 +77,4 @@ def test_its_shadow_falls_away_from_it_and_is_dark(shown: Shown) -> None:
     behind, before = FREE + (RADIUS_M + 0.07) * away, FREE - (RADIUS_M + 0.09) * away
     # By the scene's own light .48, of which the post hides a part near its foot. Seen: .29.
     assert 0.2 < shown.ratio_at(behind) < 0.5
-    assert 0.85 < shown.ratio_at(before) < 1.15  # seen: 1.08 to 1.11, by how often it was found anew
+    assert 0.85 < shown.ratio_at(before) < 1.1

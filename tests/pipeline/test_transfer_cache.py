@@ -66,8 +66,8 @@ def test_a_moving_camera_shows_what_it_would_without(
     device: Device, shares: list[float], name: str, preset: Preset
 ) -> None:
     """But for some codes in a few pixels; again the same. ART traces pixels anew where samples differ: in one frame
-    nine at the ball's foot, where it does so with what is kept, as dark as in RM's picture, and without does not."""
-    unsure = 12 if PRESETS[preset].adaptive else 0
+    eight at the ball's foot, where it does so with what is kept, as dark as in RM's picture, and without does not."""
+    unsure = 8 if PRESETS[preset].adaptive else 0
     source = GallerySource(name, width=160)
     on, again, off = (
         pictures_of([result for _, result in play(device, source, wishes_of(source, cache=cache, preset=preset))])
@@ -130,7 +130,7 @@ def test_a_thing_that_comes_in_shades_nearly_as_without(device: Device, preset: 
     for cached, exact in zip(on, off, strict=True):
         apart = np.abs(cached.astype(int) - exact).max(axis=-1)
         assert apart.max() <= 18  # seen: 10
-        assert (apart > 1).mean() < 0.03  # seen: 0.022
+        assert (apart > 1).mean() < 0.02  # seen: 0.013
         assert flip_map(cached, exact).mean() < 0.009  # seen: 0.0048
 
 

@@ -49,25 +49,25 @@ class KeptTable:
         """[n, 3] what is shown in the next frame, in which samples would find `own`; since: see kept_shadows.py. fills:
         what is found is kept; else the frame is still to come."""
         self.now += 1
-        shown, asked = own.copy(), dict[int, Entry]()
+        shown, asked = own.copy(), dict[int, tuple[tuple[bool, int], Entry]]()
         self.anew = 0
         for i, (key, place) in enumerate(self.cells):
             entry = self.entries.get(place)
             entry = entry if entry is not None and entry.key == key else None
             is_true = entry is not None and entry.frame >= since
-            if entry is not None and is_true and not self._is_due(entry, place):
-                shown[i] = entry.value
-                continue
-            self.anew += 1
-            value, lasts = own[i], entry.lasts if entry is not None else 1
+            is_other, lasts = False, 1 if entry is None else entry.lasts
             if entry is not None and is_true:
-                is_same = np.abs(own[i] - entry.value).max() <= self.close
-                value = (own[i] + entry.value) / 2 if is_same else own[i]
-                lasts = min(2 * entry.lasts, self.longest) if is_same else max(entry.lasts // 2, 1)
-            shown[i] = value
-            asked.setdefault(place, Entry(key, self.now, value, lasts))
+                if not self._is_due(entry, place):
+                    shown[i] = entry.value
+                    continue
+                is_other = bool(np.abs(own[i] - entry.value).max() > self.close)
+                shown[i] = own[i] if is_other else (own[i] + entry.value) / 2
+                lasts = 1 if is_other else min(2 * entry.lasts, self.longest)
+            self.anew += 1
+            mine = (not is_other, i), Entry(key, self.now, shown[i], lasts)
+            asked[place] = min(asked.get(place, mine), mine, key=lambda each: each[0])
         if fills:
-            self.entries |= asked
+            self.entries |= {place: entry for place, (_, entry) in asked.items()}
         else:
             self.now -= 1
         return shown

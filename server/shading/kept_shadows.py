@@ -3,8 +3,9 @@
 What they take from a place of real surface, R' / R of eq. 7.1, depends on the place, on the things and on the light
 from all sides, but not on the camera. So does what real and virtual things take from virtual surface. Both are kept by
 cell of the world (shadow_cells.py). A value is found anew in the next frame, because a young scan grows from frame to
-frame; if it is the same, after two, four, LONGEST; if not, in the next one again. When a thing has moved, or the light has
-become another, all are found anew. The light of a room is estimated every few frames and moves a little each time.
+frame; if all samples of the cell find the same, after two, four, LONGEST; if not, in the next one again. When a thing
+has moved, or the light has become another, all are found anew. The light of a room is estimated every few frames and
+moves a little each time.
 """
 
 from __future__ import annotations

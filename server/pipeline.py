@@ -198,9 +198,7 @@ class Pipeline:
             smooth_edges=settings.edges == "smooth",
             restores_clipped=not settings.as_thesis,
             waits_for_light=waits_for_light,
-            follows_light=not settings.has_caches
-            or reuse.reason is not None
-            or (reuse.is_checkpoint and reuse.is_still),
+            follows_light=not settings.has_caches or reuse.reason is not None,
         )
 
     def _sample_transfer(

@@ -95,8 +95,6 @@ class ReuseDecision:
     """Version of the values that this frame caches or finds."""
     is_checkpoint: bool = False
     """Whether this frame's picture is compared to see whether the view has settled."""
-    is_still: bool = False
-    """Whether the view is that of the frame before."""
     echo: CullReason | None = None
     """Frames that the light has not used yet, while their effect can still be seen."""
 
@@ -159,7 +157,6 @@ class TemporalReuse:
             keeps_geometry=keeps_geometry,
             version=Version(self._view, self._objects, count % period),
             is_checkpoint=self._reason is None and count % period == 0,
-            is_still=count > 1,
             echo=CullReason(ECHO, ALLOWANCE) if self._echo_frames else None,
         )
 

@@ -103,11 +103,11 @@ def test_what_noise_changes_is_bounded(device: Device) -> None:
 
 
 def test_what_is_placed_and_moved_before_a_resting_view_is_drawn(device: Device) -> None:
-    """As it would be with everything simulated, without caches; a byte may differ by the rounding of sums."""
+    """As it would be with everything simulated; a byte may differ by the rounding of sums."""
     source, pipelines = GallerySource("still-and-empty"), []
     ball = load_mesh(GalleryObject(0.2, (0.0, 0.0, 0.0)).glb(), "glb")
     for plan in ("needed", "everything"):
-        pipeline = ClientSession(device, source.camera, wishes_of(source, plan=plan, cache="off"))
+        pipeline = ClientSession(device, source.camera, wishes_of(source, plan=plan))
         results = []
         for index in range(28):
             if index == 10:

@@ -31,7 +31,7 @@ def is_denoised(kernels: set[str]) -> bool:
 
 
 def test_no_denoiser_where_the_light_is_given_and_nothing_else_reads_it(device: Device) -> None:
-    pictures, plan, kernels = played(device, albedo="constant", cache="off")
+    pictures, plan, kernels = played(device, albedo="constant")
     everything, whole, all_kernels = played(device, albedo="constant", plan="everything")
     assert left_out(plan).items() >= {"denoise": 0.0, "estimate_light": 0.0}.items()
     assert not is_denoised(kernels)

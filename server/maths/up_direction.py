@@ -34,6 +34,8 @@ LEAST_SHARE = 0.25
 LEAST_FIXED = 0.09
 """Least share of all normals that must fix the less certain tilt: horizontal surface, or the smaller of two walls.
 Evenly distributed normals give 0.045."""
+_TOGETHER = 64
+"""Directions that are tried together: their cosines with 2 000 normals fit into a processor's cache."""
 _RARE = 5e-5  # share of all normals below which a bin is noise of the measurement
 
 
@@ -109,14 +111,22 @@ def _best_start(normals: Floats, shares: Floats, camera_up: Floats) -> Floats:
     """[3] of directions near `camera_up`, the one that most normals lie along or across."""
     starts = spherical_fibonacci(CANDIDATES)
     starts = starts[starts @ camera_up > np.cos(np.radians(MOST_TILT_DEG))]
-    cosines = starts @ normals.T
-    sine = np.sin(np.radians(WIDTHS_DEG[0]))
-    level = np.sqrt(1 - sine**2)
-    counted = (cosines > level) + CEILINGS * (cosines < -level) + WALLS * (np.abs(cosines) < sine)
+    parts = np.array_split(starts, max(len(starts) // _TOGETHER, 1))
+    counted = np.concatenate([_counted(part, normals, shares) for part in parts])
     # Cameras are held about level: a wall that one looks up at is else taken for the floor that another looks down at.
     levelness = (starts @ camera_up) ** 2
-    best: Floats = starts[np.argmax((counted @ shares) * levelness)]
+    best: Floats = starts[np.argmax(counted * levelness)]
     return best
+
+
+def _counted(starts: Floats, normals: Floats, shares: Floats) -> Floats:
+    """[n] what lies along or across each of these directions [n, 3]."""
+    cosines = (starts @ normals.T).astype(np.float32)
+    shares_single = shares.astype(np.float32)
+    sine = np.sin(np.radians(WIDTHS_DEG[0]))
+    level = np.sqrt(1 - sine**2)
+    above, below, across = cosines > level, cosines < -level, np.abs(cosines) < sine
+    return above @ shares_single + CEILINGS * (below @ shares_single) + WALLS * (across @ shares_single)
 
 
 def _octahedral_bins(normals: Floats) -> NDArray[np.int64]:

@@ -21,6 +21,8 @@ LABEL_NONE, LABEL_STATIC, LABEL_DYNAMIC, LABEL_FILLED = 0, 1, 2, 3
 
 _TILE = 8  # as in raycast.cl
 _SPACING = 2  # as in raycast.cl
+_REST_ENTRY = 5  # ENTRY of raycast.cl
+_REST_TURNS = 16  # TURNS of raycast.cl
 _FARTHEST = int(np.float32(np.inf).view(np.int32))
 
 
@@ -38,7 +40,7 @@ class _RayBuffers(StageBuffers):
     farthest = BufferDescription(np.int32)
     """[tile row, tile column] depth at which rays end, in the same form."""
     rest = BufferDescription(np.int32)
-    """Pixels whose rays are walked last, of raycast_between."""
+    """Rays that those beside them do not tell, of raycast_between: their number, then _REST_ENTRY values of each."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +78,14 @@ def raycast(
         *_ray_bounds(engine, camera, volume_from_camera, volume),
     )
     pixels = camera.width * camera.height
-    rest = engine.buffers(_RayBuffers).rest.array((2 * pixels + 1,))
+    rest = engine.buffers(_RayBuffers).rest.array((1 + _REST_ENTRY * pixels,))
     engine.fill(rest[:1], 0)
     squares = (-(-camera.width // (_SPACING * lanes)), -(-camera.height // _SPACING))
     engine.launch(_kernel(engine, "raycast"), squares, *view, positions, normals)
     engine.launch(_kernel(engine, "raycast_between"), squares, *view, positions, normals, rest)
-    few = (max(64 // lanes, 1),)  # items of a group: only the first of them have work
-    engine.launch(_kernel(engine, "raycast_rest"), (-(-pixels // lanes),), *view, rest, positions, normals, local=few)
+    few = (4,) if lanes > 1 else (64,)  # items of a group: only the first of them have work
+    items = -(-pixels // (lanes * _REST_TURNS if lanes > 1 else 1))
+    engine.launch(_kernel(engine, "raycast_rest"), (items,), *view, rest, positions, normals, local=few)
     return Surface(positions, normals, buffers.labels.array(size))
 
 

@@ -60,8 +60,10 @@ def compare_with_twin(engine: Engine, volume: Volume, camera: CameraModel, view:
     """smooth: pixels away from silhouettes.
 
     The kernel finds the crossing by one or two Newton steps instead of bisection. Where the field is smooth that is
-    exact to the field's curvature. Beside silhouettes fused views disagree, the field bends within a voxel, and rays
-    graze solid voxels that the kernel may miss. On the border of what was seen it extrapolates by up to 1.5 voxels.
+    exact to the field's curvature. Three of four rays are found between those around them, which are at most two
+    voxels apart, where these have seen one smooth surface. Beside silhouettes fused views disagree, the field bends within a voxel, and
+    rays graze solid voxels that the kernel may miss. On the border of what was seen it extrapolates by up to 1.5
+    voxels.
     """
     hit, depth, normal = cast(engine, volume, camera, view)
     pose = volume.volume_from_world() @ view
@@ -72,12 +74,17 @@ def compare_with_twin(engine: Engine, volume: Volume, camera: CameraModel, view:
     assert (expected & ~hit).mean() < 5e-3
     assert (hit & ~expected).mean() < 15e-3
     both = hit & expected & smooth
-    error = np.abs(depth - expected_depth)[both] / volume.voxel_m
-    assert np.median(error) < 1e-4  # seen: 2e-6
-    assert np.percentile(error, 99) < 0.01  # seen: 0.0016
-    turned = degrees_between(normal, normals)[both]
-    assert np.median(turned) < 0.04  # seen: 0.027, where rays are two voxels apart
-    assert np.percentile(turned, 99) < 0.6  # seen: 0.22
+    error = np.abs(depth - expected_depth) / volume.voxel_m
+    turned = degrees_between(normal, normals)
+    walked, between = both.copy(), both.copy()
+    walked[1::2] = walked[:, 1::2] = between[::2, ::2] = False
+    assert np.median(error[walked]) < 1e-4  # seen: 2e-6
+    assert np.percentile(error[walked], 99) < 0.01  # seen: 0.0016
+    assert np.median(turned[walked]) < 0.04  # seen: 0.027, where rays are two voxels apart
+    assert np.percentile(turned[walked], 99) < 0.6  # seen: 0.22
+    assert np.median(error[between]) < 0.01  # seen: 0.004
+    assert np.percentile(error[between], 99) < 0.1  # seen: 0.02 of true distances, 0.09 of fused depth
+    assert np.percentile(turned[between], 99) < 3  # seen: 0.6, and 2.1
     np.testing.assert_allclose(np.linalg.norm(normal[hit], axis=-1), 1, atol=1e-6)
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Generic, TypeVar
 
-Result = TypeVar("Result")
+from server.children.priority import yield_to_others
 
-NICENESS = 10
-"""Of the thread: the frames' threads have about nine times its share of a busy processor."""
+Result = TypeVar("Result")
 
 
 class Beside(Generic[Result]):
@@ -39,13 +37,7 @@ class Beside(Generic[Result]):
 
     def _run(self, work: Callable[[], Result]) -> None:
         try:
-            _yield_to_others()
+            yield_to_others()
             self._future.set_result(work())
         except BaseException as error:  # raised again where the result is asked for
             self._future.set_exception(error)
-
-
-def _yield_to_others() -> None:
-    """Lower this thread's priority, where the system has one for each thread (Linux)."""
-    if hasattr(os, "setpriority") and os.uname().sysname == "Linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)

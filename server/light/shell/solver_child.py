@@ -8,7 +8,7 @@ import traceback
 
 import numpy as np
 
-from server.light.shell.beside import NICENESS
+from server.children.priority import NICENESS
 from server.light.shell.patches import MOST_PATCHES, RAYS
 from server.light.shell.solution import Solution
 from server.light.shell.solver import Solver

@@ -126,7 +126,7 @@ def _counted(starts: Floats, normals: Floats, shares: Floats) -> Floats:
     sine = np.sin(np.radians(WIDTHS_DEG[0]))
     level = np.sqrt(1 - sine**2)
     above, below, across = cosines > level, cosines < -level, np.abs(cosines) < sine
-    return above @ shares_single + CEILINGS * (below @ shares_single) + WALLS * (across @ shares_single)
+    return np.asarray(above @ shares_single + CEILINGS * (below @ shares_single) + WALLS * (across @ shares_single))
 
 
 def _octahedral_bins(normals: Floats) -> NDArray[np.int64]:

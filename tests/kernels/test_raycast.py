@@ -61,9 +61,9 @@ def compare_with_twin(engine: Engine, volume: Volume, camera: CameraModel, view:
 
     The kernel finds the crossing by one or two Newton steps instead of bisection. Where the field is smooth that is
     exact to the field's curvature. Three of four rays are found between those around them, which are at most two
-    voxels apart, where these have seen one smooth surface. Beside silhouettes fused views disagree, the field bends within a voxel, and
-    rays graze solid voxels that the kernel may miss. On the border of what was seen it extrapolates by up to 1.5
-    voxels.
+    voxels apart, where these have seen one smooth surface. Beside silhouettes fused views disagree, the field bends
+    within a voxel, and rays graze solid voxels that the kernel may miss. On the border of what was seen it
+    extrapolates by up to 1.5 voxels.
     """
     hit, depth, normal = cast(engine, volume, camera, view)
     pose = volume.volume_from_world() @ view

@@ -12,14 +12,16 @@ materials, bilinear on a grid over the chroma of albedo. o_f is what surface f (
 has besides, a_f its chroma, d_r and c_r what region r of it has further; they are eliminated exactly (elimination.py).
 Minimised is
 
-    sum_p huber(e_p / S_p) + sum_k ((z_k - n_k) / s_k)^2 + sum_(k,l) rho(z_k - z_l)
-    + sum_g ((m_g - m) / s_m)^2 + ((m - m_0) / s_0)^2 + ((b - log B) / s_b)^2 + sum_f tau(o_f) + sum_r (d_r / s_d)^2
+    sum_p huber(e_p / S_p) + sum_k ((z_k - n_k) / s_k)^2 + sum_j 2 a (exp(z_j - n_j) - z_j + n_j)
+    + sum_(k,l) rho(z_k - z_l) + sum_g ((m_g - m) / s_m)^2 + ((m - m_0) / s_0)^2 + ((b - log B) / s_b)^2
+    + sum_f tau(o_f) + sum_r (d_r / s_d)^2
     + sum_p |e'_p / S'_p|^2 + sum_k |(u_k - t) / s_u|^2 + sum_(k,l) c |u_k - u_l|^2 + |t / s_t|^2 + sum_f |a_f / s_a|^2
     + sum_r log(1 + |c_r / s_c|^2) + |(w - w_0) / s_w|^2
 
-over neighbouring sources (k,l). tau is 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1), which becomes linear at d, sooner below
-0 than above, and steep where the albedo exceeds 1. n_k of floor that was not scanned is the log of what the other
-sources bring there, with nothing in between, plus the mean log albedo of floor that was; of all others it is one value.
+over lobes j at infinity, all other sources k (all of them in the sums of u), and neighbours (k,l). tau is
+2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1), which becomes linear at d, sooner below 0 than above, and steep where the
+albedo exceeds 1. n_k of floor that was not scanned is the log of what the other sources bring there, with nothing in
+between, plus the mean log albedo of floor that was; of all others it is one value, and n_j is another.
 b is the log albedo of the brightest white surface, the mean of log s(B_p m) + o_f(p) between two ranks of patches that
 count as their chroma is like w_0, white paint's; it sets the level. w is the mean chroma of albedo of the patches, of
 any chroma, between these ranks; for the light from beyond the scan, b and w are left out, and tau is quadratic above 0.
@@ -49,7 +51,6 @@ from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
 
 LOGIT = float(np.log(weights.MEAN_ALBEDO / (1 - weights.MEAN_ALBEDO)))
-GIVEN_LOGIT = float(np.log(weights.GIVEN_ALBEDO / (1 - weights.GIVEN_ALBEDO)))
 BRIGHTEST_RANKS = np.linspace(0.91, 0.99, 9)
 """Ranks of the patches, as shares of all, that are the brightest surface: without outliers, and with many patches, so
 that what they show in the mean changes steadily."""
@@ -160,7 +161,7 @@ def step(
     """
     switches, count = switches or Switches(), sources.count
     finds_level = switches.albedos and sources.finds_level
-    middle = _begin_level(unknowns, evidence, finds_level=finds_level)
+    middle = _begin_level(unknowns, evidence, finds_level=finds_level, has_materials=switches.albedos)
     prior = np.where(sources.is_saturated, 0.0, unknowns.mean) + sources.offset
     known_logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
     known = np.where(sources.known.max(axis=1) > 0, np.exp(known_logs[:, 0]), 0.0)
@@ -192,10 +193,9 @@ def step(
     matrix, vector = surfaces.normal_equations(design, residual[:, None])
     right = vector[:, 0].astype(np.float64)
     right[:count] -= _smoothen(matrix, z, sources.pairs)
-    diagonal = np.concatenate([1 / sources.deviation**2, np.full(len(nodes), 1 / spreads.material**2)])
-    matrix[np.diag_indices_from(matrix)] += diagonal
-    target = np.concatenate([prior - z, middle - unknowns.materials[nodes]])
-    change = unknowns.solve(matrix, right + diagonal * target)
+    bent, pull = _priors(z - prior, sources, unknowns.materials[nodes] - middle, spreads.material)
+    matrix[np.diag_indices_from(matrix)] += bent
+    change = unknowns.solve(matrix, right + pull)
     change *= min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
     change *= unknowns.relax(change[:count])
     unknowns.step = float(np.sqrt(np.mean((parts @ change[:count]) ** 2)))
@@ -217,6 +217,20 @@ def step(
             finds_albedos=switches.albedos,
         )
     unknowns.radiance = _radiance(unknowns, sources)
+
+
+def _priors(above: Floats, sources: Sources, materials: Floats, spread: float) -> tuple[Floats, Floats]:
+    """[k + albedos] half the curvature of the priors, and half their slope downwards.
+
+    above: [k] z - n of the sources; materials: [albedos] m_g - m, with this standard deviation. The curvature for a
+    lobe is at least that at n: it vanishes where lobes are dark, and steps would have no end.
+    """
+    bent = np.concatenate([1 / sources.deviation**2, np.full(len(materials), 1 / spread**2)])
+    pull = -bent * np.concatenate([above, materials])
+    excess = np.exp(above[: sources.lobes])
+    bent[: sources.lobes] = weights.LOBE_SHAPE * np.maximum(excess, 1.0)
+    pull[: sources.lobes] = weights.LOBE_SHAPE * (1 - excess)
+    return bent, pull
 
 
 def _parts(shares: Singles, level: Singles, arriving: Floats) -> Singles:
@@ -241,10 +255,14 @@ def _set_floor_prior(
     prior[FLOOR] = np.log(np.maximum(sources.floor.shares @ level[:CELLS], DARKEST)) + albedo
 
 
-def _begin_level(unknowns: Unknowns, evidence: Evidence, *, finds_level: bool) -> float:
-    """The logit of albedo about which the materials lie; sets the mean of the sources."""
-    middle = unknowns.middle if finds_level else GIVEN_LOGIT
-    unknowns.mean = float(np.log(evidence.mean / (1.0 if finds_level else weights.GIVEN_ALBEDO)))
+def _begin_level(unknowns: Unknowns, evidence: Evidence, *, finds_level: bool, has_materials: bool) -> float:
+    """The logit of albedo about which the materials lie; sets the mean of the sources.
+
+    has_materials: albedos are found; else all of them are the given one.
+    """
+    given = weights.DISTANT_ALBEDO if has_materials else weights.GIVEN_ALBEDO
+    middle = unknowns.middle if finds_level else float(np.log(given / (1 - given)))
+    unknowns.mean = float(np.log(evidence.mean / (1.0 if finds_level else given)))
     if unknowns.known == 0:
         unknowns.materials[:] = middle
     return middle

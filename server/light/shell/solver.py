@@ -22,12 +22,9 @@ MOVED, or less where what they show hardly changes, down to STILL."""
 MOVED, DISTANT_MOVED, NEW_MOVED = 0.02, 0.05, 0.01
 """Change of a logarithm; the second value holds for the light from beyond the scan, both while the light is steady; the
 third for a light that is new."""
-FIRST_SHARE, DISTANT_SHARE, FIRST_SOLUTIONS = 0.5, 0.2, 10
-"""Of each step for the light from beyond the scan: in so many first solutions, and later. Lobes that overlap take the
-light of each other, and not always the same ones: what stops sooner is nearer to the prior. With whole steps to the end
-mitsuba_room is 17.6 degrees off in the mean instead of 13.5; with .5 throughout, one code of noise turns the kitchen's
-light by up to 10 degrees within 70 frames instead of 4; with .2 throughout, what four far views of a table show is not
-caught up with (13 degrees off instead of 8)."""
+DISTANT_SHARE = 0.3
+"""Of each step for the light from beyond the scan, which pictures tell little of: it turns by half as much as with
+whole steps where what is told changes a little."""
 STILL = 0.005
 """What patches show has not changed while the root mean square of the change of its logarithm is at most this, and a
 solution has settled while its last step's is: half a per cent is less than a code of a picture."""
@@ -58,7 +55,6 @@ class Solver:
         self._near, self._distant = Unknowns(), Unknowns()
         self._last: Solution | None = None
         self._side_m = side_m
-        self._solutions = 0
 
     def solve(
         self, patches: Patches, bright: EmittersSeen, traced: NDArray[np.int64], camera: Floats, up: Floats
@@ -83,9 +79,7 @@ class Solver:
         near = near_sources(self._transport, shell, patches, evidence.rows)
         distant = distant_sources(self._transport, closed, evidence.rows, with_indirect=switches.indirect)
         first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
-        share = FIRST_SHARE if self._solutions < FIRST_SOLUTIONS else DISTANT_SHARE
-        self._distant.most_relaxation = share ** (1 - patches.outdated)
-        self._solutions += 1
+        self._distant.most_relaxation = DISTANT_SHARE ** (1 - patches.outdated)
         change = self._last.change_in(patches) if self._last else np.inf
         moved = MOVED * float(np.clip(change / STILL, STILL / MOVED, 1.0))
         for unknowns, sources, steady in ((self._near, near, moved), (self._distant, distant, DISTANT_MOVED)):

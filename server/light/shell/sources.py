@@ -44,9 +44,11 @@ class Sources:
     offset: Floats
     """[k] prior mean of the log radiance over the mean; of saturated ones, of their relative excess."""
     deviation: Floats
-    """[k] standard deviation of it."""
+    """[k] standard deviation of it; not of the first `lobes`."""
     pairs: Ints
     """[m, 2] neighbours."""
+    lobes: int = 0
+    """Of so many sources, the first, the prior is a gamma distribution, most probable at `offset`."""
     finds_level: bool = True
     """The mean albedo of the materials, and so the level of the light, is found with the rest; else it is given."""
     least_share: float = 0.0
@@ -105,9 +107,10 @@ def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_in
         known=known,
         clipped=np.concatenate([np.zeros((LOBES, 3)), transport.clipped[:count]]),
         is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[:count]]),
-        offset=np.concatenate([np.full(LOBES, weights.LOBE), offset]),
-        deviation=np.concatenate([np.full(LOBES, weights.LOBE_SPREAD), deviation]),
+        offset=np.concatenate([np.full(LOBES, np.log(weights.LOBE)), offset]),
+        deviation=np.concatenate([np.ones(LOBES), deviation]),
         pairs=_PAIRS + LOBES,
+        lobes=LOBES,
         finds_level=False,
         least_share=0.0 if with_indirect else LEAST_OPENNESS,
     )

@@ -12,7 +12,7 @@ materials, bilinear on a grid over the chroma of albedo. o_f is what surface f (
 has besides, a_f its chroma, d_r and c_r what region r of it has further; they are eliminated exactly (elimination.py).
 Minimised is
 
-    sum_p huber(e_p / S_p) + sum_k ((z_k - n_k) / s_k)^2 + sum_j 2 a (exp(z_j - n_j) - z_j + n_j)
+    sum_p huber(e_p / S_p) + sum_k ((z_k - n_k) / s_k)^2 + sum_j 2 (exp(z_j - n_j) - z_j + n_j) / s_j^2
     + sum_(k,l) rho(z_k - z_l) + sum_g ((m_g - m) / s_m)^2 + ((m - m_0) / s_0)^2 + ((b - log B) / s_b)^2
     + sum_f tau(o_f) + sum_r (d_r / s_d)^2
     + sum_p |e'_p / S'_p|^2 + sum_k |(u_k - t) / s_u|^2 + sum_(k,l) c |u_k - u_l|^2 + |t / s_t|^2 + sum_f |a_f / s_a|^2
@@ -228,8 +228,8 @@ def _priors(above: Floats, sources: Sources, materials: Floats, spread: float) -
     bent = np.concatenate([1 / sources.deviation**2, np.full(len(materials), 1 / spread**2)])
     pull = -bent * np.concatenate([above, materials])
     excess = np.exp(above[: sources.lobes])
-    bent[: sources.lobes] = weights.LOBE_SHAPE * np.maximum(excess, 1.0)
-    pull[: sources.lobes] = weights.LOBE_SHAPE * (1 - excess)
+    pull[: sources.lobes] = bent[: sources.lobes] * (1 - excess)
+    bent[: sources.lobes] *= np.maximum(excess, 1.0)
     return bent, pull
 
 

@@ -44,11 +44,11 @@ class Sources:
     offset: Floats
     """[k] prior mean of the log radiance over the mean; of saturated ones, of their relative excess."""
     deviation: Floats
-    """[k] standard deviation of it; not of the first `lobes`."""
+    """[k] standard deviation of it; of lobes, that of a normal distribution as wide where theirs is highest."""
     pairs: Ints
     """[m, 2] neighbours."""
     lobes: int = 0
-    """Of so many sources, the first, the prior is a gamma distribution, most probable at `offset`."""
+    """Number of lobes, which come first; the prior of their radiance is a gamma distribution, highest at `offset`."""
     finds_level: bool = True
     """The mean albedo of the materials, and so the level of the light, is found with the rest; else it is given."""
     least_share: float = 0.0
@@ -108,7 +108,7 @@ def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_in
         clipped=np.concatenate([np.zeros((LOBES, 3)), transport.clipped[:count]]),
         is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[:count]]),
         offset=np.concatenate([np.full(LOBES, np.log(weights.LOBE)), offset]),
-        deviation=np.concatenate([np.ones(LOBES), deviation]),
+        deviation=np.concatenate([np.full(LOBES, weights.LOBE_SHAPE**-0.5), deviation]),
         pairs=_PAIRS + LOBES,
         lobes=LOBES,
         finds_level=False,

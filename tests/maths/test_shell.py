@@ -29,7 +29,7 @@ from server.light.shell.shell import (
 from server.light.shell.sources import distant_sources
 from server.light.shell.switches import Switches
 from server.light.shell.transport import SATURATED, Transport, meet
-from server.maths.lobes import LOBES
+from server.maths.lobes import LOBES, lobes_to_sh
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from tests.reference.room_objective import chroma_objective, level_objective, middle_objective
 from tests.scenes.analytic import Floats
@@ -411,12 +411,24 @@ def test_lobes_that_patches_do_not_tell_apart_share_the_light() -> None:
     distant = room.distant()
     first, second = np.argsort(distant.shares[:, :LOBES].sum(axis=0))[-2:]
     distant.shares[:, [first, second]] = distant.shares[:, [first, second]].mean(axis=1, keepdims=True)
+    distant.offset[[first, second]] = distant.offset[[first, second]].mean()
     step(unknowns, room.evidence, distant)
     unknowns.z[first], unknowns.z[second] = unknowns.z[first] + 2, unknowns.z[second] - 2
     for _ in range(150):
         step(unknowns, room.evidence, distant)
     # Seen: .01. Of a normal distribution of the logarithm: 3.9 after 60 steps, the brighter one keeps the light.
     assert unknowns.z[first] == pytest.approx(unknowns.z[second], abs=0.1)
+
+
+def test_where_nothing_is_known_light_comes_from_above() -> None:
+    """The prior alone: a zenith e times as bright as a nadir, about gravity and not an axis of the world."""
+    up = np.array([0.6, 0.0, 0.8])
+    transport = make_room(None, sky(np.array(OPEN[0]))).transport
+    distant = distant_sources(transport, np.ones(SIDES), up, np.zeros(0, np.int64), with_indirect=True)
+    light = lobes_to_sh(2) @ np.exp(distant.offset[:LOBES])
+    assert angle_deg(light, sh_basis(up[None], 2)[0]) < 3  # seen: 1.0
+    assert np.ptp(distant.offset[:LOBES]) == pytest.approx(2 * weights.LOBE_UP, rel=0.1)
+    assert distant.offset[LOBES:].max() <= 0.0
 
 
 def test_before_a_solve_there_is_no_distant_light() -> None:
@@ -429,7 +441,7 @@ def test_before_a_solve_there_is_no_distant_light() -> None:
 def test_a_closed_box_says_nothing_of_what_is_beyond() -> None:
     room = make_room(LAMP, AMBIENT)
     unknowns, evidence = Unknowns(), room.evidence
-    closed = distant_sources(room.transport, np.ones(SIDES), evidence.rows, with_indirect=True)
+    closed = distant_sources(room.transport, np.ones(SIDES), room.shell.axes[2], evidence.rows, with_indirect=True)
     for _ in range(25):
         step(unknowns, evidence, closed)
     light = distant_light(unknowns.solved(LOBES), 4)

@@ -62,7 +62,8 @@ class ShellRoom:
         """Lobes, and the cells of sides that were scanned."""
         rows = self.patches.used
         closed = closed_sides(self.patches.positions[rows], self.patches.normals[rows], self.shell.axes, PATCH_M)
-        return distant_sources(self.transport, closed, self.evidence.rows, with_indirect=with_indirect)
+        up = self.shell.axes[2]
+        return distant_sources(self.transport, closed, up, self.evidence.rows, with_indirect=with_indirect)
 
     def solve(self, steps: int) -> None:
         """Take steps towards the light of the shell."""

@@ -79,7 +79,9 @@ class Solver:
         closed = closed_sides(positions, normals, shell.axes, side_m, has_walls=has_walls)
         evidence = evidence_of(patches, rows, switches)
         near = near_sources(self._transport, shell, patches, evidence.rows)
-        distant = distant_sources(self._transport, closed, evidence.rows, with_indirect=switches.indirect)
+        distant = distant_sources(
+            self._transport, closed, shell.axes[2], evidence.rows, with_indirect=switches.indirect
+        )
         first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
         share = FIRST_SHARE if self._solutions < FIRST_SOLUTIONS else DISTANT_SHARE
         self._distant.most_relaxation = share ** (1 - patches.outdated)

@@ -12,7 +12,7 @@ from server.light.shell import weights
 from server.light.shell.patches import Patches
 from server.light.shell.shell import CELLS, SIDE, Shell, neighbours
 from server.light.shell.transport import Transport
-from server.maths.lobes import LOBES
+from server.maths.lobes import LOBES, lobe_directions
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -88,10 +88,11 @@ def _priors(transport: Transport) -> tuple[Floats, Floats]:
     return np.where(is_saturated, offset, 0.0), np.where(is_saturated, spread, weights.CELL_HIDDEN)
 
 
-def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_indirect: bool) -> Sources:
+def distant_sources(transport: Transport, closed: Floats, up: Floats, rows: Ints, *, with_indirect: bool) -> Sources:
     """What leaves through open sides of the shell goes to infinity; closed sides are wall.
 
-    closed: [6] from 0, open, to 1. The first LOBES sources are the lobes. with_indirect: surfaces send light.
+    closed: [6] from 0, open, to 1. up: [3] unit, world. The first LOBES sources are the lobes. with_indirect: surfaces
+    send light.
     """
     count = transport.columns
     is_closed = closed.astype(np.float32)
@@ -107,7 +108,7 @@ def distant_sources(transport: Transport, closed: Floats, rows: Ints, *, with_in
         known=known,
         clipped=np.concatenate([np.zeros((LOBES, 3)), transport.clipped[:count]]),
         is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[:count]]),
-        offset=np.concatenate([np.full(LOBES, np.log(weights.LOBE)), offset]),
+        offset=np.concatenate([np.log(weights.LOBE) + weights.LOBE_UP * (lobe_directions() @ up), offset]),
         deviation=np.concatenate([np.full(LOBES, weights.LOBE_SHAPE**-0.5), deviation]),
         pairs=_PAIRS + LOBES,
         lobes=LOBES,

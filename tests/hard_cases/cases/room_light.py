@@ -56,7 +56,9 @@ def solved(room: ShellRoom, closed: Floats | None = None) -> Unknowns:
     """The light from beyond the scan; closed: of its sides, where it is not as was scanned."""
     unknowns, evidence = Unknowns(), room.evidence
     rows = evidence.rows
-    sources = room.distant() if closed is None else distant_sources(room.transport, closed, rows, with_indirect=True)
+    sources = room.distant()
+    if closed is not None:
+        sources = distant_sources(room.transport, closed, room.shell.axes[2], rows, with_indirect=True)
     for _ in range(STEPS):
         step(unknowns, evidence, sources)
     return unknowns

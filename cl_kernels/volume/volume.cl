@@ -1,5 +1,5 @@
 // Tables of the brick volume: bricks near the measured surface, solid cells, and gaps between solid bricks.
-// Provides mark_bricks, find_solid, find_near_solid, gaps_along_x, gap_along_axis.
+// Provides mark_bricks, find_solid, find_near_solid, gaps_in_slices, gaps_along_z.
 #include "camera.clh"
 #include "volume.clh"
 
@@ -151,13 +151,11 @@ kernel void find_near_solid(const int count, global const int *listed, const int
 #define CHANGED_LOW 0
 #define CHANGED_HIGH 3
 
-// solid [z][y][x], occupied [z][y][x] (1: the brick had a solid voxel at the last update) -> occupied, changed [6], and
-// gap [2][z][y][x]: bricks to the nearest occupied one of the row, at most `limit`, towards lower x and towards higher. One item a row.
-kernel void gaps_along_x(const int4 bricks, global const ulong *solid, const int limit, global uchar *occupied,
-                         global int *changed, global uchar *gap) {
-    const int y = get_global_id(0);
-    const int z = get_global_id(1);
-    if (y >= bricks.y || z >= bricks.z) return;
+// Row (y, z) of solid [z][y][x] and occupied [z][y][x] (1: the brick had a solid voxel at the last update) -> occupied, and
+// gap [2][z][y][x]: bricks to the nearest occupied one of the row, at most `limit`, towards lower x and towards higher. -> the first and
+// the last x that changed; where none did, (bricks.x, -1), and the gaps stay.
+static int2 row_gaps(const int4 bricks, const int y, const int z, const int limit, global const ulong *solid, global uchar *occupied,
+                     global uchar *gap) {
     const int first = (z * bricks.y + y) * bricks.x;
     int low = bricks.x, high = -1, back = limit, ahead = limit;
     for (int x = 0; x < bricks.x; x++) {
@@ -168,7 +166,7 @@ kernel void gaps_along_x(const int4 bricks, global const ulong *solid, const int
             occupied[first + x] = now;
         }
     }
-    if (high < 0) return;
+    if (high < 0) return (int2)(low, high);
     for (int x = 0; x < bricks.x; x++) {
         back = occupied[first + x] ? 0 : min(back + 1, limit);
         gap[first + x] = (uchar)back;
@@ -178,27 +176,14 @@ kernel void gaps_along_x(const int4 bricks, global const ulong *solid, const int
         ahead = occupied[first + x] ? 0 : min(ahead + 1, limit);
         onward[first + x] = (uchar)ahead;
     }
-    atomic_min(changed + CHANGED_LOW, low);
-    atomic_min(changed + CHANGED_LOW + 1, y);
-    atomic_min(changed + CHANGED_LOW + 2, z);
-    atomic_max(changed + CHANGED_HIGH, high);
-    atomic_max(changed + CHANGED_HIGH + 1, y);
-    atomic_max(changed + CHANGED_HIGH + 2, z);
+    return (int2)(low, high);
 }
 
-// Adds one axis (1 = y, 2 = z) to the one-sided Chebyshev distance: the minimum, over bricks `offset` ahead, of max(offset,
-// their distance so far). inner [variants][z][y][x] and 16 bytes more -> gap [2 variants][z][y][x]: towards lower indices, then towards
-// higher ones; only near the `changed` box. One item 16 bricks of a row.
-kernel void gap_along_axis(const int4 bricks, const int variants, global const uchar *inner, const int axis, const int limit,
-                           global const int *changed, global uchar *gap) {
-    const int x = max(min(16 * (int)get_global_id(0), bricks.x - 16), 0);
-    const int y = get_global_id(1);
-    const int z = get_global_id(2) % bricks.z;
-    const int variant = get_global_id(2) / bricks.z;
-    if (16 * get_global_id(0) >= bricks.x || y >= bricks.y || variant >= 2 * variants) return;
-    if (x + 15 < changed[CHANGED_LOW] - limit || x > changed[CHANGED_HIGH] + limit) return;
-    if (y < changed[CHANGED_LOW + 1] - limit || y > changed[CHANGED_HIGH + 1] + limit) return;
-    if (z < changed[CHANGED_LOW + 2] - limit || z > changed[CHANGED_HIGH + 2] + limit) return;
+// Adds one axis (1 = y, 2 = z) to the one-sided Chebyshev distance of 16 bricks from (x, y, z) on: the minimum, over bricks `offset`
+// ahead, of max(offset, their distance so far). inner [variants][z][y][x] and 16 bytes more -> gap [2 variants][z][y][x]: towards lower
+// indices, then towards higher ones.
+static void add_axis(const int4 bricks, const int x, const int y, const int z, const int variant, const int variants, const int axis,
+                     const int limit, global const uchar *inner, global uchar *gap) {
     const int volume = bricks.x * bricks.y * bricks.z;
     const int position = axis == 1 ? y : z;
     const int size = axis == 1 ? bricks.y : bricks.z;
@@ -218,4 +203,58 @@ kernel void gap_along_axis(const int4 bricks, const int variants, global const u
     uchar values[16];
     vstore16(nearest, 0, values);
     for (int i = 0; i < bricks.x; i++) to[i] = values[i];
+}
+
+// First of the 16 bricks of a row that are worked on together.
+static inline int first_of_16(const int4 bricks, const int part) {
+    return max(min(16 * part, bricks.x - 16), 0);
+}
+
+#define SLICE_VARIANTS 4  // ways along x and y
+
+// solid, occupied [z][y][x] as of row_gaps -> occupied, changed [6], and gaps along x and then y: along_x [2][z][y][x],
+// along_y [4][z][y][x]. A group of any size is a slice of one z, which is all that these two axes need.
+kernel void gaps_in_slices(const int4 bricks, global const ulong *solid, const int limit, global uchar *occupied,
+                           global int *changed, global uchar *along_x, global uchar *along_y) {
+    local int box[4];  // of what changed in the slice: low x, low y, high x, high y
+    const int item = get_local_id(0), items = get_local_size(0), z = get_group_id(0);
+    if (item == 0) box[0] = bricks.x, box[1] = bricks.y, box[2] = -1, box[3] = -1;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int y = item; y < bricks.y && z < bricks.z; y += items) {
+        const int2 ends = row_gaps(bricks, y, z, limit, solid, occupied, along_x);
+        if (ends.y < 0) continue;
+        atomic_min(box, ends.x);
+        atomic_min(box + 1, y);
+        atomic_max(box + 2, ends.y);
+        atomic_max(box + 3, y);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+    if (z >= bricks.z || box[2] < 0) return;
+    if (item == 0) {
+        atomic_min(changed + CHANGED_LOW, box[0]);
+        atomic_min(changed + CHANGED_LOW + 1, box[1]);
+        atomic_min(changed + CHANGED_LOW + 2, z);
+        atomic_max(changed + CHANGED_HIGH, box[2]);
+        atomic_max(changed + CHANGED_HIGH + 1, box[3]);
+        atomic_max(changed + CHANGED_HIGH + 2, z);
+    }
+    const int parts = (bricks.x + 15) / 16, low = max(box[1] - limit, 0), rows = min(box[3] + limit, bricks.y - 1) - low + 1;
+    for (int piece = item; piece < parts * rows * SLICE_VARIANTS; piece += items) {
+        const int x = first_of_16(bricks, piece % parts), y = low + (piece / parts) % rows, variant = piece / (parts * rows);
+        if (x + 15 < box[0] - limit || x > box[2] + limit) continue;
+        add_axis(bricks, x, y, z, variant, SLICE_VARIANTS / 2, 1, limit, along_x, along_y);
+    }
+}
+
+// The third axis: along_y [4][z][y][x] and 16 bytes more -> gap [8][z][y][x], only near the `changed` box. One item 16 bricks of a row.
+kernel void gaps_along_z(const int4 bricks, global const uchar *along_y, const int limit, global const int *changed, global uchar *gap) {
+    const int x = first_of_16(bricks, get_global_id(0));
+    const int y = get_global_id(1);
+    const int z = get_global_id(2) % bricks.z;
+    const int variant = get_global_id(2) / bricks.z;
+    if (16 * get_global_id(0) >= bricks.x || y >= bricks.y || variant >= 2 * SLICE_VARIANTS) return;
+    if (x + 15 < changed[CHANGED_LOW] - limit || x > changed[CHANGED_HIGH] + limit) return;
+    if (y < changed[CHANGED_LOW + 1] - limit || y > changed[CHANGED_HIGH + 1] + limit) return;
+    if (z < changed[CHANGED_LOW + 2] - limit || z > changed[CHANGED_HIGH + 2] + limit) return;
+    add_axis(bricks, x, y, z, variant, SLICE_VARIANTS, 2, limit, along_y, gap);
 }

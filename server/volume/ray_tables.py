@@ -14,6 +14,7 @@ from server.volume.brick_pool import BrickPool, rounded, upload_list
 
 GREATEST_GAP = 15
 _CELL_ROWS = 16
+_SLICE_ITEMS = 64  # of a group of gaps_in_slices
 _UNCHANGED = np.array([1 << 30] * 3 + [-(1 << 30)] * 3, np.int32)
 
 
@@ -84,26 +85,23 @@ class RayTables:
         engine, (x, y, z), bricks = self._engine, self.bricks, int4(*self.bricks, 0)
         engine.workspace.copy(self._changed, _UNCHANGED)
         engine.launch(
-            engine.kernel("volume.cl", "gaps_along_x"),
-            (y, z),
+            engine.kernel("volume.cl", "gaps_in_slices"),
+            (_SLICE_ITEMS * z,),
             bricks,
             self.solid,
             GREATEST_GAP,
             self._occupied,
             self._changed,
-            self._inner[0],
-            local=(16, 1),
+            *self._inner,
+            local=(_SLICE_ITEMS,),
         )
-        for axis, (inner, outer) in enumerate(((self._inner[0], self._inner[1]), (self._inner[1], self.gaps)), start=1):
-            engine.launch(
-                engine.kernel("volume.cl", "gap_along_axis"),
-                (-(-x // 16), y, z * (2 << axis)),
-                bricks,
-                1 << axis,
-                inner,
-                axis,
-                GREATEST_GAP,
-                self._changed,
-                outer,
-                local=(1, 8, 8),
-            )
+        engine.launch(
+            engine.kernel("volume.cl", "gaps_along_z"),
+            (-(-x // 16), y, 8 * z),
+            bricks,
+            self._inner[1],
+            GREATEST_GAP,
+            self._changed,
+            self.gaps,
+            local=(1, 8, 8),
+        )

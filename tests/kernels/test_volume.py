@@ -187,8 +187,8 @@ def test_a_side_that_is_not_there_is_no_matter_of_voxels(engine: Engine) -> None
 class Gaps:
     """The tables' kernels and their buffers; every step is compared with its twin."""
 
-    def __init__(self, engine: Engine, shape: tuple[int, int, int], limit: int) -> None:
-        self._engine, self._shape, self._limit = engine, shape, limit
+    def __init__(self, engine: Engine, shape: tuple[int, int, int], limit: int, items: int = 64) -> None:
+        self._engine, self._shape, self._limit, self._items = engine, shape, limit, items
         space, count = engine.workspace, int(np.prod(shape))
         self._occupied = space.upload("occupied", np.full(count, 255, np.uint8))
         self._gaps = [space.array(f"gap_{axis}", ((2 << axis) * count + 16,), np.uint8) for axis in range(3)]
@@ -200,18 +200,16 @@ class Gaps:
         """[octant, z, y, x]"""
         engine, (z, y, x), bricks = self._engine, self._shape, int4(*self._shape[::-1], 0)
         changed = engine.workspace.upload("changed", np.array([1 << 30] * 3 + [-(1 << 30)] * 3, np.int32))
-        tables = (engine.workspace.upload("solid", solid), self._limit, self._occupied, changed, self._gaps[0])
-        engine.launch(engine.kernel("volume.cl", "gaps_along_x"), (y, z), bricks, *tables)
+        listed, kernel = engine.workspace.upload("solid", solid), engine.kernel("volume.cl", "gaps_in_slices")
+        tables = (listed, self._limit, self._occupied, changed, *self._gaps[:2])
+        engine.launch(kernel, (self._items * z,), bricks, *tables, local=(self._items,))
         expected = twin.changed_box(self._known, solid != 0)
         np.testing.assert_array_equal(engine.download(changed).reshape(2, 3), expected)
         self._known = solid != 0
-        inner = self._compared(0, twin.start_gaps(solid, self._limit)[None])
-        for axis in (1, 2):
-            size, rest = (-(-x // 16), y, z * (2 << axis)), (self._limit, changed, self._gaps[axis])
-            kernel = engine.kernel("volume.cl", "gap_along_axis")
-            engine.launch(kernel, size, bricks, 1 << axis, self._gaps[axis - 1], axis, *rest)
-            inner = self._compared(axis, inner)
-        return inner
+        inner = self._compared(1, self._compared(0, twin.start_gaps(solid, self._limit)[None]))
+        kernel, rest = engine.kernel("volume.cl", "gaps_along_z"), (self._limit, changed, self._gaps[2])
+        engine.launch(kernel, (-(-x // 16), y, 8 * z), bricks, self._gaps[1], *rest)
+        return self._compared(2, inner)
 
     def _compared(self, axis: int, inner: NDArray[np.uint8]) -> NDArray[np.uint8]:
         expected = twin.gap_along_axis(inner, axis, self._limit)
@@ -227,7 +225,8 @@ def test_gaps_match_brute_force(engine: Engine, shape: tuple[int, int, int], sha
     occupied = np.random.default_rng(sum(shape)).random(shape) < share
     solid = np.where(occupied, np.uint64(1) << np.uint64(41), np.uint64(0))
     expected = twin.octant_gaps(occupied, LIMIT)
-    np.testing.assert_array_equal(Gaps(engine, shape, LIMIT).update(solid), expected)
+    for items in (64, 4):  # of a group: more and fewer than a slice has rows
+        np.testing.assert_array_equal(Gaps(engine, shape, LIMIT, items).update(solid), expected)
 
 
 def test_gaps_stop_at_their_limit(engine: Engine) -> None:

@@ -21,7 +21,8 @@ Minimised is
 over lobes j at infinity, all other sources k (all of them in the sums of u), and neighbours (k,l). tau is
 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1), which becomes linear at d, sooner below 0 than above, and steep where the
 albedo exceeds 1. n_k of floor that was not scanned is the log of what the other sources bring there, with nothing in
-between, plus the mean log albedo of floor that was; of all others it is one value, and n_j is another.
+between, plus the mean log albedo of floor that was; of all others it is one value, and n_j is another, which grows with
+the lobe's elevation.
 b is the log albedo of the brightest white surface, the mean of log s(B_p m) + o_f(p) between two ranks of patches that
 count as their chroma is like w_0, white paint's; it sets the level. w is the mean chroma of albedo of the patches, of
 any chroma, between these ranks; for the light from beyond the scan, b and w are left out, and tau is quadratic above 0.

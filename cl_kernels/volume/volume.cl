@@ -1,6 +1,7 @@
 // Tables of the brick volume: bricks near the measured surface, solid cells, and gaps between solid bricks.
 // Provides mark_bricks, find_solid, find_near_solid, gaps_in_slices, gaps_along_z.
 #include "camera.clh"
+#include "groups.clh"
 #include "volume.clh"
 
 #define TILE 4
@@ -217,7 +218,7 @@ static inline int first_of_16(const int4 bricks, const int part) {
 kernel void gaps_in_slices(const int4 bricks, global const ulong *solid, const int limit, global uchar *occupied,
                            global int *changed, global uchar *along_x, global uchar *along_y) {
     local int box[4];  // of what changed in the slice: low x, low y, high x, high y
-    const int item = get_local_id(0), items = get_local_size(0), z = get_group_id(0);
+    const int item = get_local_id(0), items = get_local_size(0), z = group_number();
     if (item == 0) box[0] = bricks.x, box[1] = bricks.y, box[2] = -1, box[3] = -1;
     barrier(CLK_LOCAL_MEM_FENCE);
     for (int y = item; y < bricks.y && z < bricks.z; y += items) {

@@ -43,7 +43,7 @@ def test_the_kitchens_light_stays(device: Device) -> None:
     of_spread = {row.name: row.value for row in part.rows if row.name.endswith("of its spread")}
     turns = {row.name: row.value for row in part.rows if row.name.endswith("light turns by, at most")}
     assert (len(of_spread), len(turns)) == (5, 5)
-    assert max(of_spread.values()) < 60, of_spread  # seen: 5 to 30; 236 where lobes had many minima
+    assert max(of_spread.values()) < 60, of_spread  # seen: 9 to 46; 236 where lobes had many minima
     frame_less = turns.pop("kitchen, the same frames, a frame left out: light turns by, at most")
-    assert frame_less < 10  # seen: 6.3
-    assert max(turns.values()) < 6, turns  # seen: 1.6 to 4.4
+    assert frame_less < 6  # seen: 3.7
+    assert max(turns.values()) < 10, turns  # seen: 1.6 to 8.4, of half a voxel

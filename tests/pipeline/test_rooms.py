@@ -24,7 +24,7 @@ from server.scene.placement import Placement
 from tests.scenes import corners
 from tests.scenes.analytic import Floats
 from tests.scenes.corners import FLOOR, WALL, corner_frame, degrees_across
-from tests.scenes.lights import degrees_between, lobe_and_sky
+from tests.scenes.lights import lobe_and_sky
 from tests.scenes.meshes import shape_of
 from tests.scenes.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes
 
@@ -89,7 +89,8 @@ def lit(device: Device, parts: list[int], *, together: bool, **more: object) -> 
 def test_one_plane_says_that_it_does_not_know_the_direction(device: Device, part: int) -> None:
     light = lit(device, [part] * 8, together=False)
     assert not light.valid
-    assert degrees_between(light.dominant_direction, TOWARDS) > 25
+    assert light.spread_deg is not None
+    assert light.spread_deg > 25  # the floor's is 25 degrees off and more, the wall's by luck 9: light comes from above
 
 
 @pytest.mark.parametrize(("albedo", "most_deg"), [("estimated", 8.0), ("constant", 8.0)])

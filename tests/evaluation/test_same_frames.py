@@ -46,4 +46,6 @@ def test_the_kitchens_light_stays(device: Device) -> None:
     assert max(of_spread.values()) < 60, of_spread  # seen: 9 to 46; 236 where lobes had many minima
     frame_less = turns.pop("kitchen, the same frames, a frame left out: light turns by, at most")
     assert frame_less < 6  # seen: 3.7
-    assert max(turns.values()) < 10, turns  # seen: 1.6 to 8.4, of half a voxel
+    shifted = turns.pop("kitchen, the same frames, half a voxel's shift: light turns by, at most")
+    assert shifted < 10  # seen: 8.4
+    assert max(turns.values()) < 6, turns  # seen: 1.6 to 5.1

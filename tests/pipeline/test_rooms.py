@@ -24,7 +24,7 @@ from server.scene.placement import Placement
 from tests.scenes import corners
 from tests.scenes.analytic import Floats
 from tests.scenes.corners import FLOOR, WALL, corner_frame, degrees_across
-from tests.scenes.lights import lobe_and_sky
+from tests.scenes.lights import degrees_between, lobe_and_sky
 from tests.scenes.meshes import shape_of
 from tests.scenes.rooms import BOUNDS, CAMERA, VOXEL_M, frame_at, view_at, wishes
 
@@ -71,13 +71,13 @@ def scan(pipeline: ClientSession, steps: range, client_from_room: Floats | None 
     return result
 
 
-def lit(device: Device, parts: list[int], *, together: bool, **more: object) -> Light:
+def lit(device: Device, parts: list[int], *, together: bool, light: Floats = LIGHT, **more: object) -> Light:
     """The light after frames of these planes, each by a client of its own, alone or in one room."""
     asked = structs.replace(corners.WISHES, **more)
     room = Room(device, asked, "corner") if together else None
     pipelines = {part: ClientSession(device, corners.CAMERA, asked, room) for part in sorted(set(parts))}
     for index, part in enumerate(parts):
-        result = pipelines[part].process(corner_frame(part, index, LIGHT))
+        result = pipelines[part].process(corner_frame(part, index, light))
     for pipeline in pipelines.values():
         pipeline.close()
     if room:
@@ -85,12 +85,14 @@ def lit(device: Device, parts: list[int], *, together: bool, **more: object) -> 
     return result.light
 
 
-@pytest.mark.parametrize("part", [FLOOR, WALL])
-def test_one_plane_says_that_it_does_not_know_the_direction(device: Device, part: int) -> None:
-    light = lit(device, [part] * 8, together=False)
+@pytest.mark.parametrize(("part", "towards"), [(FLOOR, TOWARDS), (WALL, (0.5, 0.2, 0.8))])
+def test_one_plane_says_that_it_does_not_know_the_direction(
+    device: Device, part: int, towards: tuple[float, float, float]
+) -> None:
+    """Nor does it: a light from where none is expected is not found."""
+    light = lit(device, [part] * 8, together=False, light=0.3 * lobe_and_sky(towards))
     assert not light.valid
-    assert light.spread_deg is not None
-    assert light.spread_deg > 25  # the floor's is 25 degrees off and more, the wall's by luck 9: light comes from above
+    assert degrees_between(light.dominant_direction, towards) > 25
 
 
 @pytest.mark.parametrize(("albedo", "most_deg"), [("estimated", 8.0), ("constant", 8.0)])

@@ -58,9 +58,8 @@ a light in one way. With a normal distribution of the logarithm it costs least t
 are as many minima: a picture less turned the light of the real kitchen by 31 degrees."""
 LOBE_UP = 0.5
 """By how much the logarithm of the most probable radiance grows with the sine of elevation, for light comes from above:
-fitted to the medians of four environment maps .2, .6, .8 and 1.2; of ten published lights of nine coefficients, the
-first bands of which are those of .5 to 3, all ten come from above. About half of that, since a table may be lit from
-beside."""
+fitted to the medians of four environment maps it is .2, .6, .8 and 1.2, to the first band of ten published lights .5 to
+3. Less than that, since with 1 lamps that stand beside a scan are found too high (docs/light.md)."""
 LIT_EXCESS, LIT_SPREAD = 0.2, 1.0
 """For saturated surface that may be lit paint: mean radiance beyond what the picture shows, relative to that, and the
 standard deviation of its log."""

@@ -163,15 +163,29 @@ class Mailbox:
             self._on_taken()
         return taken
 
+    def show_next_frame(self, to: Callable[[Frame], None]) -> None:
+        """Any thread: `to` is called with the oldest unread frame, if any, which is not taken before it returns."""
+        with self._changed:
+            for queued in self._messages:
+                if isinstance(queued.message, Frame):
+                    to(queued.message)
+                    return
+
+    def has_message(self) -> bool:
+        """Whether `take` would not wait."""
+        with self._changed:
+            return bool(self._messages) or self._closed
+
     def is_idle(self) -> bool:
         """Whether nothing is unread and the reader has finished the last message: it waits for another one."""
         with self._changed:
             return not self._messages and not self._is_reader_busy
 
-    def note_answered(self) -> None:
-        """Call before answering the last frame taken: the client may then send another."""
+    def note_answered(self, connection: int) -> None:
+        """Call before answering a frame that was taken, which came over that connection: the client may then send
+        another."""
         with self._changed:
-            if self._taken_from == self._connection:
+            if connection == self._connection:
                 self._unanswered -= 1
 
     def begin_connection(self) -> None:

@@ -1,4 +1,4 @@
-"""One capturing client: the event loop reads its socket into a mailbox; one worker thread processes and answers."""
+"""One capturing client: the event loop reads its socket into a mailbox; a worker processes and answers (worker.py)."""
 
 from __future__ import annotations
 
@@ -306,6 +306,8 @@ class CaptureSession:
             self._mailbox_has_space.clear()
             await self._mailbox_has_space.wait()
         receipt = self._mailbox.post(message)
+        if isinstance(message, Frame):
+            self._worker.begin_reading()
         if receipt.replaced is not None:
             await self._say_replaced(receipt.replaced)
         if receipt.frames_ahead > FAR_TOO_MANY_INFLIGHT and not self._told_of_window:

@@ -1,4 +1,7 @@
-"""Worker thread of one capturing session: owns the pipeline, reads frames, encodes answers. Uses no asyncio."""
+"""Worker thread of one capturing session: owns the pipeline. Uses no asyncio.
+
+While a frame is computed, the one before it is encoded and sent, and the one after it is read, in threads of their own.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import contextlib
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
@@ -119,8 +123,9 @@ class Worker:
         self._share = context.scheduler.join(hello.room)
         self._load_mesh = context.mesh_loader()
         self._frames = FrameReader(hello.camera, context.color_reader(hello.camera))
-        self._arrived_s = self._waited_ms = 0.0
-        """Arrival time and waiting time of the newest frame."""
+        self._delivering = ThreadPoolExecutor(1, "answers")
+        self._delivery: Future[None] | None = None
+        """Of the newest frame. Nothing else is sent before it is done."""
         self._load_shedding = LoadShedding(hello.wishes, context.target_period_s)
         self._acknowledged: OrderedDict[int, Acknowledged] = OrderedDict()
         """Acknowledgements by request number: a client that lost its connection may repeat requests."""
@@ -141,19 +146,38 @@ class Worker:
                 except ValueError as error:
                     raise Refusal(POLICY, str(error)) from error
                 self._outbox.greet(pipeline.device_name)
-                while (queued := self._mailbox.take()) is not None:
+                while (queued := self._take()) is not None:
                     self._handle(pipeline, queued)
+                self._finish_delivery()
         finally:
             self._context.scheduler.leave(self._share)
+            self._delivering.shutdown()
             self._frames.close()
 
+    def begin_reading(self) -> None:
+        """Any thread: what comes next may have arrived, and can be read while the device is at work."""
+        self._mailbox.show_next_frame(self._frames.begin)
+
+    def _take(self) -> QueuedMessage | None:
+        """The next message; while none is there, all that came before is answered."""
+        if not self._mailbox.has_message():
+            self._finish_delivery()
+        return self._mailbox.take()
+
+    def _finish_delivery(self) -> None:
+        """Wait until the newest frame is answered. Raises what that raised."""
+        delivery, self._delivery = self._delivery, None
+        if delivery is not None:
+            delivery.result()
+
     def _handle(self, pipeline: ClientSession, queued: QueuedMessage) -> None:
-        self._outbox.answer_to(queued.connection)
         if isinstance(queued.message, Frame):
-            self._arrived_s = queued.arrived_s
             self._context.metrics.queue_age_s.observe(queued.age_ms / 1e3)
-            self._answer_frame(pipeline, queued.message)
-        elif isinstance(queued.message, RequestMesh):
+            self._answer_frame(pipeline, queued.message, queued)
+            return
+        self._finish_delivery()
+        self._outbox.answer_to(queued.connection)
+        if isinstance(queued.message, RequestMesh):
             self._send_mesh(pipeline, queued.message.request)
         elif isinstance(queued.message, RequestPanorama):
             self._send_panorama(pipeline, queued.message)
@@ -216,30 +240,37 @@ class Worker:
                 self._acknowledged.popitem(last=False)
         return done
 
-    def _answer_frame(self, pipeline: ClientSession, frame: Frame) -> None:
+    def _answer_frame(self, pipeline: ClientSession, frame: Frame, queued: QueuedMessage) -> None:
         known = next((answer for number, answer in self._answers if number == frame.frame), None)
         if known is not None:
-            return self._send_answer(known)
-        overhead = _Overhead(self._outbox, self._frames)
+            self._outbox.answer_to(queued.connection)
+            return self._send_answer(known, queued.connection)
+        overhead = _Overhead(self._outbox, self._context.metrics, self._frames)
         try:
-            rgbd = self._read(frame)
+            with overhead.measured():
+                rgbd = self._read(frame)
         except ProtocolError as error:
-            return self._drop(frame, "unreadable", error)
+            return self._drop(frame, queued.connection, "unreadable", error)
+        self.begin_reading()
         if self._load_shedding.limit(self._context.scheduler.busy, pipeline.predicted_s):
             self._sample_as_granted(pipeline)
         try:
-            with overhead.excluded(), self._context.scheduler.acquire(self._share) as turn:
-                self._waited_ms = (time.perf_counter() - self._arrived_s) * 1e3
+            with self._context.scheduler.acquire(self._share) as turn:
+                waited_ms = queued.age_ms
                 frame_turn = _FrameTurn(turn, self._outbox)
                 result = pipeline.process(rgbd, watched=self._outbox.is_watched(), turn=frame_turn)
                 self._adapt_sampling(pipeline)
         except ValueError as error:
-            return self._drop(frame, "refused", error)
+            return self._drop(frame, queued.connection, "refused", error)
         self._context.metrics.turn_s.observe(turn.waited_s)
         self._context.metrics.observe_stages(result.timings)
         self._context.metrics.processed.inc()
-        self._deliver(frame, result)
-        return overhead.record(self._context.metrics)
+        self._finish_delivery()
+        done = _Drawn(frame, queued.connection, result, self._plan(result.plan), waited_ms, overhead)
+        self._delivery = self._delivering.submit(self._deliver, done)
+        if self._hello.wishes.lossless:  # which may ask for it again next
+            self._finish_delivery()
+        return None
 
     def _adapt_sampling(self, pipeline: ClientSession) -> None:
         """Apply the load-shedding step: cheaper sampling under load, the requested sampling otherwise."""
@@ -295,36 +326,51 @@ class Worker:
             self._context.metrics.decode_s.observe(time.perf_counter() - start_s)
         return read
 
-    def _drop(self, frame: Frame, cause: str, error: ValueError) -> None:
+    def _drop(self, frame: Frame, connection: int, cause: str, error: ValueError) -> None:
+        self._finish_delivery()
+        self._outbox.answer_to(connection)
         self._context.metrics.dropped.labels(cause).inc()
-        self._mailbox.note_answered()
+        self._mailbox.note_answered(connection)
         self._outbox.send(encode(Dropped(frame=frame.frame, reason=one_line(str(error)))))
 
-    def _deliver(self, frame: Frame, result: FrameResult) -> None:
-        wishes, light = self._hello.wishes, encode(result.light)
-        plan = self._plan(result.plan)
+    def _deliver(self, done: _Drawn) -> None:
+        """Encode and send a frame's answer, while the next one is computed."""
+        self._outbox.answer_to(done.connection)
+        with done.overhead.measured(sends=True):
+            self._send_drawn(done)
+        done.overhead.record()
+
+    def _send_drawn(self, done: _Drawn) -> None:
+        wishes, frame, result, plan = self._hello.wishes, done.frame, done.result, done.plan
+        light = encode(result.light)
+
+        def timed(make: Callable[[], Composite | Layer]) -> bytes:
+            start_s = time.perf_counter()
+            data = encode(structs.replace(make(), waited_ms=done.waited_ms))
+            self._context.metrics.encode_s.observe(time.perf_counter() - start_s)
+            return data
 
         def composite(*, lossless: bool) -> bytes:
-            return self._timed(lambda: composite_message(frame, result, plan, lossless=lossless))
+            return timed(lambda: composite_message(frame, result, plan, lossless=lossless))
 
         answer: tuple[bytes, ...] = (light,)
         if wishes.answer != "light":  # which does not wait until the picture is encoded
             self._outbox.send(light)
-            drawn = self._timed(lambda: layer_message(frame, result, plan)) if wishes.answer == "layer" else None
+            drawn = timed(lambda: layer_message(frame, result, plan)) if wishes.answer == "layer" else None
             answer = (light, drawn or composite(lossless=wishes.lossless))
         if wishes.lossless:
             self._answers.append((frame.frame, answer))
-        self._mailbox.note_answered()
+        self._mailbox.note_answered(done.connection)
         self._outbox.send(answer[-1])
         if self._outbox.is_watched() and result.color is not None:
             is_shown = wishes.answer == "picture" and not wishes.lossless
             self._outbox.publish((light, answer[-1] if is_shown else composite(lossless=False)))
 
-    def _send_answer(self, answer: tuple[bytes, ...]) -> None:
+    def _send_answer(self, answer: tuple[bytes, ...], connection: int) -> None:
         *before, last = answer
         for message in before:
             self._outbox.send(message)
-        self._mailbox.note_answered()
+        self._mailbox.note_answered(connection)
         self._outbox.send(last)
 
     def _plan(self, plan: Plan) -> Plan:
@@ -334,13 +380,6 @@ class Worker:
         sharing, steps = self._context.scheduler.busy, self._load_shedding.steps
         reason = f"{sharing} sessions share the device: {steps} below what was asked"
         return structs.replace(plan, point=structs.replace(plan.point, reason=reason))
-
-    def _timed(self, make: Callable[[], Composite | Layer]) -> bytes:
-        """Build and encode an answer, and record the time."""
-        start_s = time.perf_counter()
-        data = encode(structs.replace(make(), waited_ms=self._waited_ms))
-        self._context.metrics.encode_s.observe(time.perf_counter() - start_s)
-        return data
 
 
 @dataclass(frozen=True)
@@ -365,27 +404,42 @@ class _FrameTurn:
 
 
 class _Overhead:
-    """Time that one frame takes outside of the pipeline: wall time without waiting for the socket, and CPU time."""
+    """Time that one frame takes outside of the pipeline: wall time without waiting for the socket, and CPU time.
 
-    def __init__(self, outbox: Outbox, frames: FrameReader) -> None:
-        self._outbox, self._frames = outbox, frames
-        self._wall_s = -time.perf_counter() + outbox.waited_s
-        self._cpu_s = -time.thread_time() - frames.cpu_s_beside
+    Some of it goes on beside the pipeline, with another frame.
+    """
+
+    def __init__(self, outbox: Outbox, metrics: Metrics, frames: FrameReader) -> None:
+        self._outbox, self._metrics, self._frames = outbox, metrics, frames
+        self._wall_s = self._cpu_s = 0.0
 
     @contextlib.contextmanager
-    def excluded(self) -> Iterator[None]:
-        """Context that is not counted."""
-        wall_s, cpu_s = time.perf_counter(), time.thread_time()
+    def measured(self, *, sends: bool = False) -> Iterator[None]:
+        """Context that is counted. `sends`: waiting for the socket is not; nothing else is sent meanwhile."""
+        wall_s, cpu_s, waited_s = time.perf_counter(), time.thread_time(), self._outbox.waited_s
         try:
             yield
         finally:
-            self._wall_s -= time.perf_counter() - wall_s
-            self._cpu_s -= time.thread_time() - cpu_s
+            self._wall_s += time.perf_counter() - wall_s - (self._outbox.waited_s - waited_s if sends else 0.0)
+            self._cpu_s += time.thread_time() - cpu_s
 
-    def record(self, metrics: Metrics) -> None:
+    def record(self) -> None:
         """Record both times; call when the frame is answered."""
-        metrics.overhead_s.observe(self._wall_s + time.perf_counter() - self._outbox.waited_s)
-        metrics.overhead_cpu_s.observe(self._cpu_s + time.thread_time() + self._frames.cpu_s_beside)
+        self._metrics.overhead_s.observe(self._wall_s)
+        self._metrics.overhead_cpu_s.observe(self._cpu_s + self._frames.take_cpu_s())
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A frame that is to be answered."""
+
+    frame: Frame
+    connection: int
+    """Number of the one over which it came."""
+    result: FrameResult
+    plan: Plan
+    waited_ms: float
+    overhead: _Overhead
 
 
 def apply_control(

@@ -46,7 +46,8 @@ def test_a_frame_is_what_was_sent(reader: FrameReader) -> None:
     np.testing.assert_array_equal(read.depth, DEPTH)
     assert read.world_from_camera is not None
     np.testing.assert_array_equal(read.world_from_camera, np.eye(4))
-    assert reader.cpu_s_beside > 0
+    assert reader.take_cpu_s() > 0
+    assert reader.take_cpu_s() == 0
 
 
 def test_without_depth_or_pictures(reader: FrameReader) -> None:
@@ -93,3 +94,37 @@ def test_what_is_damaged_is_told_and_the_next_frame_is_read(reader: FrameReader,
     assert isinstance(read, RgbdFrame)
     np.testing.assert_array_equal(read.color, COLOR)
     np.testing.assert_array_equal(read.depth, DEPTH)
+
+
+def test_what_was_begun_is_read_once_and_in_order() -> None:
+    """Also what is never asked for; only one frame is begun at a time, and none once the reader is closed."""
+    read: list[bytes] = []
+    others = [structs.replace(MESSAGE, color=encode_color(COLOR + step, "png")) for step in range(1, 4)]
+
+    def color(data: bytes) -> NDArray[np.uint8]:
+        read.append(data)
+        return decode_picture(data)
+
+    reader = FrameReader(LENS, ColorReader(LENS, color))
+    reader.begin(others[0])
+    reader.begin(others[1])
+    for asked, shown in ((others[0], COLOR + 1), (others[2], COLOR + 3)):
+        found = reader.read(asked)
+        assert isinstance(found, RgbdFrame)
+        np.testing.assert_array_equal(found.color, shown)
+    reader.begin(others[1])
+    np.testing.assert_array_equal(reader.read(MESSAGE).color, COLOR)  # type: ignore[union-attr]
+    reader.close()
+    reader.begin(others[0])
+    data = [message.color.data for message in (others[0], others[2], others[1], MESSAGE) if message.color]
+    assert read == data
+
+
+def test_damage_is_told_to_who_asks_for_what_was_begun(reader: FrameReader) -> None:
+    assert MESSAGE.color is not None
+    damaged = structs.replace(MESSAGE, color=structs.replace(MESSAGE.color, data=MESSAGE.color.data[:50]))
+    reader.begin(damaged)
+    assert isinstance(reader.read(MESSAGE), RgbdFrame)  # nobody asked for the other
+    reader.begin(damaged)
+    with pytest.raises(ProtocolError, match="color"):
+        reader.read(damaged)

@@ -1,5 +1,7 @@
 """A capturing session over a real socket: answers, latest-wins, control messages, refused frames."""
 
+import threading
+
 import msgspec
 import numpy as np
 import pytest
@@ -20,8 +22,8 @@ from protocol.messages import (
     Spot,
 )
 from server.scene.placement import SpotPlacement
-from server.service import mailbox
-from tests.service.fakes import CAMERA, POSE, REFUSE_MM, fake_light, frame_message, rgbd_frame
+from server.service import frame_reader, mailbox, worker
+from tests.service.fakes import CAMERA, PATIENCE_S, POSE, REFUSE_MM, fake_light, frame_message, rgbd_frame
 
 
 def test_frame_is_answered_by_its_light_and_then_its_composite(dial) -> None:
@@ -54,6 +56,45 @@ def test_lossless_answers_every_frame_in_order_with_exact_pixels(dial, lab) -> N
         assert (light.frame, composite.frame) == (i, i)
         assert composite.color.codec == "png"
         np.testing.assert_array_equal(decode_color(composite.color, CAMERA), 255 - rgbd_frame(i).color)
+
+
+def test_a_frame_is_computed_while_the_answer_before_it_is_encoded(dial, lab, monkeypatch) -> None:
+    """Answers keep their order, and what was done in between is acknowledged after both."""
+    is_computed, encode = threading.Event(), worker.composite_message
+
+    def encode_late(*arguments, **options):
+        assert is_computed.wait(PATIENCE_S)
+        return encode(*arguments, **options)
+
+    monkeypatch.setattr(worker, "composite_message", encode_late)
+    wire = dial()
+    wire.greet()
+    wire.say(frame_message(0), frame_message(1), Quality(request=1, preset="reg4"))
+    assert [lab.next_entered(), lab.next_entered()] == [0, 1]
+    is_computed.set()
+    answers = [wire.hear() for _ in range(5)]
+    assert [type(answer) for answer in answers] == [Light, Composite, Light, Composite, Acknowledged]
+    assert [answer.frame for answer in answers[:4]] == [0, 0, 1, 1]
+
+
+def test_a_frame_is_read_while_the_one_before_it_is_computed(dial, lab, monkeypatch) -> None:
+    is_read, decode = threading.Semaphore(0), frame_reader.decode_depth
+
+    def decode_and_tell(*arguments):
+        is_read.release()
+        return decode(*arguments)
+
+    monkeypatch.setattr(frame_reader, "decode_depth", decode_and_tell)
+    lab.hold = True
+    wire = dial()
+    wire.greet()
+    wire.say(frame_message(0))
+    assert lab.next_entered() == 0
+    wire.say(frame_message(1))
+    assert all(is_read.acquire(timeout=PATIENCE_S) for _ in range(2))
+    lab.release(2)
+    assert [wire.hear().frame for _ in range(4)] == [0, 0, 1, 1]
+    assert not is_read.acquire(blocking=False)
 
 
 def test_newer_frame_replaces_the_one_that_waits(dial, lab) -> None:

@@ -37,11 +37,11 @@ def test_newer_frame_replaces_unread_older_one() -> None:
 def test_a_client_within_its_window_never_loses_a_frame() -> None:
     frames = [frame_message(i) for i in range(4)]
     mailbox, _ = posted_while_one_is_worked_on(2, frames[:1])
-    mailbox.note_answered()  # and before the reader takes frames[0], the client sends another
+    mailbox.note_answered(0)  # and before the reader takes frames[0], the client sends another
     assert mailbox.post(frames[1]).replaced is None
     assert mailbox.take().message is frames[0]
     assert mailbox.post(frames[2]).replaced is frames[1]
-    mailbox.note_answered()
+    mailbox.note_answered(0)
     assert mailbox.post(frames[3]).replaced is None
     assert drain(mailbox, 2) == [frames[2], frames[3]]
 
@@ -51,7 +51,7 @@ def test_frames_of_a_lost_connection_are_neither_counted_nor_replaced() -> None:
     mailbox, _ = posted_while_one_is_worked_on(2, frames[:1])
     mailbox.begin_connection()
     assert [mailbox.post(frame).replaced for frame in frames[1:4]] == [None, None, frames[1]]
-    mailbox.note_answered()  # the one that was worked on: it was never of this window
+    mailbox.note_answered(0)  # the one that was worked on: it was never of this window
     assert mailbox.post(frames[4]).replaced is frames[2]
     assert drain(mailbox, 3) == [frames[0], *frames[3:]]
 
@@ -163,7 +163,7 @@ def test_two_threads_lose_no_control_message_and_end_with_the_newest_frame(windo
         while (queued := mailbox.take()) is not None and queued.message != quality(999):
             taken.append(queued.message)
             if isinstance(queued.message, Frame):
-                mailbox.note_answered()
+                mailbox.note_answered(0)
 
     reader = threading.Thread(target=read)
     reader.start()

@@ -48,7 +48,7 @@ class SampledTransfer:
         self._cache = TransferCache(engine) if is_cached else None
         self._sampler = self._sampler_for(sampling, rays)
         self._mean_sent = MeanSent()
-        self._has_found = False
+        self._has_found = self._has_begun = False
 
     def use(self, sampling: Sampling, rays: int) -> None:
         """Change the sampling. Visibility of earlier frames is forgotten."""
@@ -109,15 +109,17 @@ class SampledTransfer:
         is_kept: bool = False,
     ) -> TransferSamples:
         """Transfer of the real world without virtual objects (eq. 5.2). up: [3] unit, world axes. is_kept: frames to
-        come are drawn with it, so that no sample waits for its turn."""
+        come are drawn with it, so that no sample waits for its turn. Nor does one of a session's first frame, most of
+        whose time is the light's anyway: virtual things would stand in a wrong light until the seventh. With samples at
+        all pixels, those beside them are near enough, and all would take a second."""
         engine, camera, rays = self._engine, self._camera, self._sampler.rays
         cache, found = self._cache if self._sampler.is_kept else None, None
         self._has_found = cache is not None
         if cache:
-            stride = self._sampler.sampling.stride
-            found = cache.find(
-                camera, volume, surface, volume_from_camera, stride, rays, ray_length_m, traces_all=is_kept
-            )
+            stride, is_first = self._sampler.sampling.stride, not self._has_begun
+            view = camera, volume, surface, volume_from_camera, stride
+            found = cache.find(*view, rays, ray_length_m, traces_all=is_kept or (is_first and stride > 1))
+        self._has_begun = True
         transfer = self._sampler.transfer(volume, surface, volume_from_camera, up, ray_length_m, found)
         hits = None
         if with_indirect:

@@ -10,8 +10,8 @@ is no exception: what a point sees of the scan depends on where it is only.
 A frame traces MOST_TRACED of its samples, in an order that covers the picture evenly: new ones first, each of them as
 far as possible from those before it, then one of each cell that is too old. New ones that wait take the values of the
 nearest sample on the same surface, three samples away at most; where there is none, they are traced as well. The next
-frames find or trace them. Old ones that wait stand as they are, ORDERS frames at most. So a first frame, or one that
-turns to what was never seen, costs little more than others.
+frames find or trace them. Old ones that wait stand as they are, ORDERS frames at most. So a frame that turns to what
+was never seen costs little more than others. A session's first one traces all (samples.py).
 
 So an entry is off by what the scan has changed around it in LONGEST + ORDERS frames at most while it is in view; one
 that comes into view again, by what has changed since it left it, for ORDERS frames.

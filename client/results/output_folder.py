@@ -30,8 +30,9 @@ from client.results.video_file import VideoFile
 from client.sources.poses import quaternion
 from protocol.messages import ArrivingLight, Light, MeshFormat
 
-_PNG = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_PAETH)
-"""One filter and runs alone: half the time of zlib's level 3 with a filter for each row, and no more bytes."""
+_PNG = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG)
+"""One filter and runs alone: two fifths of the time of zlib's level 3 with a filter for each row. Paeth's filter takes
+a quarter longer, and 8 % less bytes."""
 _LINE_FILES = ("light.jsonl", "trajectory.txt", "timings.jsonl")
 _WHOLE_FILES = ("mesh.ply", "mesh.glb", SCENE_NAME, ENVIRONMENT_NAME, PAGE_NAME, VIDEO_NAME)
 _PICTURES = {"frames": re.compile(r"\d{6,}\.png"), "camera": re.compile(r"\d{6,}\.jpg")}

@@ -1,7 +1,7 @@
 """The scan as the page of results shows it: a coloured point cloud of bounded size, gathered while frames arrive.
 
-Every frame adds a grid of its depth pixels to cells of equal size; a cell shows the mean of its points. Where cells
-become too many, they are enlarged.
+Frames add grids of their depth pixels to cells of equal size; a cell shows the mean of its points. Where cells become
+too many, they are enlarged.
 """
 
 from __future__ import annotations
@@ -30,6 +30,9 @@ SAMPLES = 12_000
 """Depth pixels of a frame that are used."""
 DENSE_FRAMES, DENSER = 6, 2
 """The first frames, and the factor by which their grid is finer, so that the scan of a short run can be recognised."""
+ALL_FRAMES, EVERY = 30, 4
+"""So many frames all add points, of later ones every fourth: at 30 frames a second hardly anything is in less than
+four, and one takes 6 ms of a processor that may be busy with the next ones."""
 GRIDS = 5
 """Number of pixel grids that frames use in turn, so that frames of a still camera differ. Few, since they are kept."""
 _PENDING = 200_000
@@ -90,11 +93,14 @@ class PointCloud:
         self._cell_m = FIRST_CELL_M
         self._cells = _Cells(np.zeros(0, np.int64), np.zeros((0, 8)))
         self._pending: list[Floats] = []
-        self._frames = 0
+        self._frames = self._seen = 0
 
     def add(self, captured: Captured, world_from_camera: Floats) -> None:
-        """Add a frame; [4, 4] metres. A frame without depth adds nothing."""
+        """Add a frame; [4, 4] metres. One without depth adds nothing, nor do most after the first ALL_FRAMES."""
         if captured.depth is None:
+            return
+        self._seen += 1
+        if self._seen > ALL_FRAMES and self._seen % EVERY:
             return
         points = self._points(captured, captured.depth, world_from_camera)
         self._pending.append(np.column_stack([points, np.ones((len(points), 2))]))

@@ -83,3 +83,16 @@ def test_what_moved_on_is_left_out() -> None:
             depth[:, :20] = 500
         cloud.add(Captured(color, depth), np.eye(4))
     assert np.mean(places_of(cloud)[:, 2] < 1) < 0.02
+
+
+def test_of_a_long_run_a_part_of_the_frames_is_enough() -> None:
+    """A camera that moves on by 10 cm a frame: what it sees of a wall is there to the end."""
+    cloud, frames = PointCloud(CAMERA), point_cloud.ALL_FRAMES + 50
+    for step in range(frames):
+        pose = np.eye(4)
+        pose[0, 3] = 0.1 * step
+        cloud.add(Captured(np.zeros((120, 160, 3), np.uint8), np.full((120, 160), 1000, np.uint16)), pose)
+    x = np.sort(places_of(cloud)[:, 0])
+    assert x[0] == pytest.approx(0.1 - 79.5 / 150, abs=0.01)  # of the second frame, and a cell
+    assert x[-1] > 0.1 * (frames - point_cloud.EVERY) + 0.2  # what the last one alone has seen is left out
+    assert np.diff(x).max() < 0.06  # a cell and a half of the largest

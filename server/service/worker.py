@@ -6,6 +6,7 @@ While a frame is computed, the one before it is encoded and sent, and the one af
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
@@ -52,6 +53,8 @@ from server.service.scheduler import REQUEST_QUANTUM_S, Scheduler, Turn
 if TYPE_CHECKING:
     from server.client_session import ClientSession
     from server.pipeline import FrameResult
+
+log = logging.getLogger(__name__)
 
 MAX_ACKNOWLEDGEMENTS = 256
 MAX_ANSWERS = 4
@@ -153,6 +156,7 @@ class Worker:
             self._context.scheduler.leave(self._share)
             self._delivering.shutdown()
             self._frames.close()
+            self._log_undelivered()
 
     def begin_reading(self) -> None:
         """Any thread: what comes next may have arrived, and can be read while the device is at work."""
@@ -169,6 +173,12 @@ class Worker:
         delivery, self._delivery = self._delivery, None
         if delivery is not None:
             delivery.result()
+
+    def _log_undelivered(self) -> None:
+        """Say why the newest frame was not answered, where another error ended the session before that was asked."""
+        error = None if self._delivery is None else self._delivery.exception()
+        if error is not None and not isinstance(error, ClientGone):
+            log.error("a frame could not be answered", exc_info=error)
 
     def _handle(self, pipeline: ClientSession, queued: QueuedMessage) -> None:
         if isinstance(queued.message, Frame):

@@ -23,7 +23,7 @@ from protocol.messages import (
 )
 from server.scene.placement import SpotPlacement
 from server.service import frame_reader, mailbox, worker
-from tests.service.fakes import CAMERA, PATIENCE_S, POSE, REFUSE_MM, fake_light, frame_message, rgbd_frame
+from tests.service.fakes import CAMERA, PATIENCE_S, POSE, REFUSE_MM, FakePipeline, fake_light, frame_message, rgbd_frame
 
 
 def test_frame_is_answered_by_its_light_and_then_its_composite(dial) -> None:
@@ -75,6 +75,34 @@ def test_a_frame_is_computed_while_the_answer_before_it_is_encoded(dial, lab, mo
     answers = [wire.hear() for _ in range(5)]
     assert [type(answer) for answer in answers] == [Light, Composite, Light, Composite, Acknowledged]
     assert [answer.frame for answer in answers[:4]] == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize("next_fails", [False, True])
+def test_an_answer_that_fails_ends_its_session_and_is_logged(dial, monkeypatch, caplog, next_fails: bool) -> None:
+    """Also where the frame that was computed meanwhile has failed before."""
+    has_failed = threading.Event()
+
+    def fail(*_arguments, **_options):
+        assert not next_fails or has_failed.wait(PATIENCE_S)
+        raise RuntimeError("no such codec")
+
+    process = FakePipeline.process
+
+    def process_and_tell(pipeline, frame, **options):
+        if frame.index == 1:
+            has_failed.set()
+            raise RuntimeError("no such frame")
+        return process(pipeline, frame, **options)
+
+    monkeypatch.setattr(worker, "composite_message", fail)
+    monkeypatch.setattr(FakePipeline, "process", process_and_tell)
+    wire = dial()
+    wire.greet()
+    wire.say(*(frame_message(i) for i in range(1 + next_fails)))
+    code, reason, _ = wire.ending()
+    assert (code, reason) == (1011, "the server failed in this session; its log says why")
+    assert "no such codec" in caplog.text
+    assert ("no such frame" in caplog.text) == next_fails
 
 
 def test_a_frame_is_read_while_the_one_before_it_is_computed(dial, lab, monkeypatch) -> None:

@@ -30,24 +30,23 @@ from protocol.messages import (
     Layer,
     MoveObject,
     Panorama,
-    PlaceObject,
     Plan,
     Quality,
-    RemoveObject,
     RequestMesh,
     RequestPanorama,
 )
 from server.meshing.files import mesh_files
 from server.scene.mesh import Mesh
-from server.scene.placement import Placement, requested_placement
 from server.service.edge.connection import POLICY, UNAUTHORIZED, ClientGone, Refusal
 from server.service.frame_reader import FrameReader
 from server.service.load_shedding import LoadShedding, SamplingRequest
-from server.service.mailbox import Mailbox, ObjectRequest, PanoramaOrder, QueuedMessage, WatcherRequest
+from server.service.mailbox import Mailbox, PanoramaOrder, QueuedMessage, WatcherRequest
 from server.service.mesh_message import mesh_parts
 from server.service.monitoring.metrics import Metrics
+from server.service.overhead import Overhead
 from server.service.result_encoding import composite_message, layer_message
 from server.service.room_registry import WrongRoomKey
+from server.service.scene_control import SceneControl, apply_control
 from server.service.scheduler import REQUEST_QUANTUM_S, Scheduler, Turn
 
 if TYPE_CHECKING:
@@ -60,7 +59,6 @@ MAX_ACKNOWLEDGEMENTS = 256
 MAX_ANSWERS = 4
 """More than the frames a client may have unanswered (session.MAX_INFLIGHT)."""
 
-SceneControl = ObjectRequest | Quality
 SaveRoom = Callable[[str], str | None]
 """Saves the room of that name and returns why it could not, one line for the client, or None."""
 
@@ -255,7 +253,7 @@ class Worker:
         if known is not None:
             self._outbox.answer_to(queued.connection)
             return self._send_answer(known, queued.connection)
-        overhead = _Overhead(self._outbox, self._context.metrics, self._frames)
+        overhead = Overhead(self._outbox, self._context.metrics, self._frames)
         try:
             with overhead.measured():
                 rgbd = self._read(frame)
@@ -413,32 +411,6 @@ class _FrameTurn:
         return self.turn.released()
 
 
-class _Overhead:
-    """Time that one frame takes outside of the pipeline: wall time without waiting for the socket, and CPU time.
-
-    Some of it goes on beside the pipeline, with another frame.
-    """
-
-    def __init__(self, outbox: Outbox, metrics: Metrics, frames: FrameReader) -> None:
-        self._outbox, self._metrics, self._frames = outbox, metrics, frames
-        self._wall_s = self._cpu_s = 0.0
-
-    @contextlib.contextmanager
-    def measured(self, *, sends: bool = False) -> Iterator[None]:
-        """Context that is counted. `sends`: waiting for the socket is not; nothing else is sent meanwhile."""
-        wall_s, cpu_s, waited_s = time.perf_counter(), time.thread_time(), self._outbox.waited_s
-        try:
-            yield
-        finally:
-            self._wall_s += time.perf_counter() - wall_s - (self._outbox.waited_s - waited_s if sends else 0.0)
-            self._cpu_s += time.thread_time() - cpu_s
-
-    def record(self) -> None:
-        """Record both times; call when the frame is answered."""
-        self._metrics.overhead_s.observe(self._wall_s)
-        self._metrics.overhead_cpu_s.observe(self._cpu_s + self._frames.take_cpu_s())
-
-
 @dataclass(frozen=True)
 class _Drawn:
     """A frame that is to be answered."""
@@ -449,42 +421,4 @@ class _Drawn:
     result: FrameResult
     plan: Plan
     waited_ms: float
-    overhead: _Overhead
-
-
-def apply_control(
-    pipeline: ClientSession, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]
-) -> Acknowledged:
-    """Apply a control message. An error is reported in the acknowledgement."""
-    try:
-        notes = _apply(pipeline, message, load_mesh)
-    except ValueError as error:  # MeshError is one
-        return Acknowledged(request=message.request, error=one_line(str(error)))
-    return Acknowledged(request=message.request, notes=tuple(one_line(note) for note in notes))
-
-
-def _apply(pipeline: ClientSession, message: SceneControl, load_mesh: Callable[[bytes, str], Mesh]) -> tuple[str, ...]:
-    match message:
-        case PlaceObject():
-            mesh = load_mesh(message.data, message.format)
-            place, size = (message.position_m, message.spot), (message.scale, message.height_m)
-            return pipeline.place_object(
-                message.object, mesh, requested_placement(mesh, *place, *size, message.yaw_deg)
-            )
-        case MoveObject():
-            with _object_known(message.object):
-                pipeline.move_object(message.object, Placement(message.position_m, message.scale, message.yaw_deg))
-        case RemoveObject():
-            with _object_known(message.object):
-                pipeline.remove_object(message.object)
-        case Quality():
-            pipeline.set_quality(message.preset, message.budget_ms, message.max_light_error_deg)
-    return ()
-
-
-@contextlib.contextmanager
-def _object_known(name: str) -> Iterator[None]:
-    try:
-        yield
-    except KeyError as error:
-        raise ValueError(f"there is no object {name!r} in this session: place it first") from error
+    overhead: Overhead

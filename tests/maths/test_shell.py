@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -14,13 +12,11 @@ from server.light.shell.objective import Unknowns, step
 from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights
 from server.light.shell.shell import (
     BEHIND_M,
-    CAMERA_M,
     CELLS,
     LEAST_HEIGHT_M,
     SIDE,
     SIDES,
     Shell,
-    closed_sides,
     neighbours,
     shell_around,
     upright,
@@ -33,7 +29,19 @@ from server.maths.lobes import LOBES, lobes_to_sh
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from tests.reference.room_objective import chroma_objective, level_objective, middle_objective
 from tests.scenes.analytic import Floats
-from tests.scenes.shell_room import CAMERA, KNOWN, NO_EMITTERS, SIZE_M, UP, Lamp, ShellRoom, make_room, sent
+from tests.scenes.shell_room import (
+    CAMERA,
+    KNOWN,
+    NO_EMITTERS,
+    OPEN,
+    SIZE_M,
+    UP,
+    Lamp,
+    ShellRoom,
+    make_room,
+    sent,
+    sky,
+)
 
 LAMP = Lamp((3.0, 0.9), 0.7, (16.0, 15.0, 14.0))
 AMBIENT = (0.3, 0.3, 0.3)
@@ -321,25 +329,6 @@ def test_the_box_holds_scan_cameras_and_a_ceiling() -> None:
     assert (grown.low[:2] <= camera[:2] - BEHIND_M + 0.1).all()  # the first camera's place is remembered
 
 
-def test_scanned_walls_close_their_sides() -> None:
-    """And bring the box from behind the camera to the wall; what faces out of the room closes nothing."""
-    place = np.stack(np.meshgrid(np.arange(0.05, 2, 0.15), np.arange(0.05, 2, 0.15)), -1).reshape(-1, 2)
-    wall = np.column_stack([np.zeros(len(place)), place])
-    floor = np.column_stack([place, np.zeros(len(place))])
-    points, normals = np.concatenate([wall, floor]), np.repeat([[1.0, 0, 0], [0, 0, 1.0]], len(place), axis=0)
-    np.testing.assert_array_equal(closed_sides(points, normals, np.eye(3), PATCH_M), [1, 0, 0, 0, 1, 0])
-    np.testing.assert_array_equal(closed_sides(points, -normals, np.eye(3), PATCH_M), np.zeros(6))
-    on_a_table = closed_sides(points, normals, np.eye(3), PATCH_M, has_walls=False)
-    np.testing.assert_array_equal(on_a_table, [0, 0, 0, 0, 1, 0])
-    some = np.arange(len(wall) - 1, len(points))  # all of the floor, and one patch of wall
-    assert 0 < closed_sides(points[some], normals[some], np.eye(3), PATCH_M)[0] < 0.3
-    camera, to_wall = np.array([[0.3, 1.0, 1.5]]), np.array([[-1.0, 0.0, 0.0]])
-    behind_m = BEHIND_M + CAMERA_M
-    for facing, has_walls, distance_m in ((normals, True, 0.3), (-normals, True, behind_m), (normals, False, behind_m)):
-        shell = shell_around(points, facing, camera, UP, PATCH_M, None, has_walls=has_walls)
-        assert shell.distances(camera, to_wall).min() == pytest.approx(distance_m, abs=0.01)
-
-
 def test_what_rays_meet() -> None:
     transport, shell = Transport(), Shell(np.eye(3), np.zeros(3), np.full(3, 4.0), 0.0, np.zeros((2, 3)))
     directions = np.array([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0, 0, -1.0]]])
@@ -370,21 +359,6 @@ def test_what_rays_meet() -> None:
 
 
 # ---- light from far away ---------------------------------------------------------------------------------------
-
-OPEN = [(0.6, 0.5, 0.6), (0.9, 0.1, 0.4), (0.3, 0.3, 0.9)]
-"""Directions of light that comes in at the sides that are not scanned."""
-
-
-def sky(towards: Floats) -> Callable[[Floats], Floats]:
-    """A dim even sky and a soft sun, 25 degrees wide."""
-    to = towards / np.linalg.norm(towards)
-
-    def radiance(directions: Floats) -> Floats:
-        apart = np.arccos(np.clip(directions @ to, -1, 1))
-        level = 0.3 + 3 * np.exp(-0.5 * (apart / np.radians(25)) ** 2)
-        return np.asarray(level[..., None] * np.ones(3))
-
-    return radiance
 
 
 @pytest.mark.parametrize("towards", OPEN)

@@ -30,6 +30,10 @@ ALBEDOS = {0: (0.6, 0.3, 0.2), 1: (0.55, 0.55, 0.5), 2: (0.3, 0.4, 0.6)}
 """Of the wall x = 0, the wall y = 0 and the floor: red, white and blue."""
 
 
+OPEN = [(0.6, 0.5, 0.6), (0.9, 0.1, 0.4), (0.3, 0.3, 0.9)]
+"""Directions of light that comes in at the sides that are not scanned."""
+
+
 @dataclass(frozen=True)
 class Lamp:
     """A square on the ceiling."""
@@ -94,6 +98,18 @@ def sent(
     arrivals = np.zeros((*distance.shape, 4))
     arrivals[is_scanned, :3], arrivals[is_scanned, 3] = known, distance[is_scanned]
     return radiance, arrivals
+
+
+def sky(towards: Floats) -> Callable[[Floats], Floats]:
+    """A dim even sky and a soft sun, 25 degrees wide."""
+    to = towards / np.linalg.norm(towards)
+
+    def radiance(directions: Floats) -> Floats:
+        apart = np.arccos(np.clip(directions @ to, -1, 1))
+        level = 0.3 + 3 * np.exp(-0.5 * (apart / np.radians(25)) ** 2)
+        return np.asarray(level[..., None] * np.ones(3))
+
+    return radiance
 
 
 def make_room(

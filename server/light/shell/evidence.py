@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,10 @@ class Evidence:
         """Mean radiance that is shown; 1 where all is clipped."""
         usable = self.level[~self.is_clipped]
         return float(np.exp(usable).mean()) if len(usable) else 1.0
+
+    def with_noise(self, variance: Floats) -> Evidence:
+        """The same where y has this `variance` [n] besides."""
+        return replace(self, precision=self.precision / (1 + self.precision * variance))
 
 
 def evidence_of(patches: Patches, rows: Ints, switches: Switches) -> Evidence:

@@ -25,7 +25,8 @@ between, plus the mean log albedo of floor that was; of all others it is one val
 the lobe's elevation.
 b is the log albedo of the brightest white surface, the mean of log s(B_p m) + o_f(p) between two ranks of patches that
 count as their chroma is like w_0, white paint's; it sets the level. w is the mean chroma of albedo of the patches, of
-any chroma, between these ranks; for the light from beyond the scan, b and w are left out, and tau is quadratic above 0.
+any chroma, between these ranks; for the light from beyond the scan, b and w are left out, tau is quadratic above 0, and
+S_p^2 is larger by what is near the patch (CONTACT_NOISE).
 n_k and m follow between the steps, m from its own two terms: all materials, and b, go along with it, since little else
 of the objective changes where all albedo grows and all light falls. The weights stand in weights.py. A patch that is
 clipped only counts where (1) is below what it shows; its material is the mean one.
@@ -124,6 +125,12 @@ class Unknowns:
         self.last = change.copy()
         return self.relaxation
 
+    def forget(self, share: float, sources: Sources, switches: Switches) -> None:
+        """Go that share of the way back to the prior. Steps after it are whole ones again, as far as they may be."""
+        self.z += share * (_prior(self, sources)[: self.known] - self.z)
+        self.materials += share * (_given_logit(has_materials=switches.albedos) - self.materials)
+        self.relaxation, self.last = self.most_relaxation, _empty()
+
     def solve(self, curvature: Singles, right: Floats) -> Floats:
         """[k + albedos] the whole Gauss-Newton step; keeps the curvature."""
         self.curvature = curvature
@@ -163,9 +170,8 @@ def step(
     switches, count = switches or Switches(), sources.count
     finds_level = switches.albedos and sources.finds_level
     middle = _begin_level(unknowns, evidence, finds_level=finds_level, has_materials=switches.albedos)
-    prior = np.where(sources.is_saturated, 0.0, unknowns.mean) + sources.offset
-    known_logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
-    known = np.where(sources.known.max(axis=1) > 0, np.exp(known_logs[:, 0]), 0.0)
+    prior = _prior(unknowns, sources)
+    known_logs, known = _known(sources)
     offsets = _means(unknowns.offsets[evidence.rows], evidence.surfaces)
     z = np.concatenate([unknowns.z, prior[unknowns.known :]])
     z += _begin(z, unknowns.known, evidence, sources, known, np.log(_logistic(middle)) + offsets)
@@ -220,6 +226,24 @@ def step(
     unknowns.radiance = _radiance(unknowns, sources)
 
 
+def received(unknowns: Unknowns, sources: Sources) -> Floats:
+    """[n] the logarithm of (1) without albedo: what patches receive. Sources that are new are at their prior."""
+    z = np.concatenate([unknowns.z, _prior(unknowns, sources)[unknowns.known :]])
+    level = _levels(z, sources).astype(np.float32)
+    return np.log(np.maximum(sources.shares @ level + _known(sources)[1], DARKEST))
+
+
+def _known(sources: Sources) -> tuple[Floats, Floats]:
+    """[n, 3] log chroma of what photographed surface brings, and [n] its mean level."""
+    logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
+    return logs, np.where(sources.known.max(axis=1) > 0, np.exp(logs[:, 0]), 0.0)
+
+
+def _prior(unknowns: Unknowns, sources: Sources) -> Floats:
+    """[k] n, but for floor that was not scanned."""
+    return np.asarray(np.where(sources.is_saturated, 0.0, unknowns.mean) + sources.offset)
+
+
 def _priors(above: Floats, sources: Sources, materials: Floats, spread: float) -> tuple[Floats, Floats]:
     """[k + albedos] half the curvature of the priors, and half their slope downwards.
 
@@ -261,12 +285,17 @@ def _begin_level(unknowns: Unknowns, evidence: Evidence, *, finds_level: bool, h
 
     has_materials: albedos are found; else all of them are the given one.
     """
-    given = weights.DISTANT_ALBEDO if has_materials else weights.GIVEN_ALBEDO
-    middle = unknowns.middle if finds_level else float(np.log(given / (1 - given)))
-    unknowns.mean = float(np.log(evidence.mean / (1.0 if finds_level else given)))
+    middle = unknowns.middle if finds_level else _given_logit(has_materials=has_materials)
+    unknowns.mean = float(np.log(evidence.mean / (1.0 if finds_level else _logistic(middle))))
     if unknowns.known == 0:
         unknowns.materials[:] = middle
     return middle
+
+
+def _given_logit(*, has_materials: bool) -> float:
+    """Of the mean albedo where it is not found."""
+    given = weights.DISTANT_ALBEDO if has_materials else weights.GIVEN_ALBEDO
+    return float(np.log(given / (1 - given)))
 
 
 def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: Floats, albedos: Floats) -> Floats:

@@ -6,26 +6,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.light.shell.bright_surface import EmittersSeen
-from server.light.shell.evidence import evidence_of
-from server.light.shell.objective import Unknowns, step
+from server.light.shell.evidence import Evidence, evidence_of
+from server.light.shell.objective import Unknowns, received, step
 from server.light.shell.patches import Patches
 from server.light.shell.shell import Shell, closed_sides, shell_around
 from server.light.shell.solution import Solution
-from server.light.shell.sources import distant_sources, near_sources
+from server.light.shell.sources import Sources, distant_sources, near_sources
 from server.light.shell.switches import Switches
 from server.light.shell.transport import Transport
+from server.light.shell.weights import CONTACT_NOISE
 from server.maths.lobes import LOBES
 
 MOST_STEPS = 16
 """Most Gauss-Newton steps of a solution. Another follows while the last one changed what patches receive by more than
 MOVED, or less where what they show hardly changes, down to STILL."""
-MOVED, DISTANT_MOVED, NEW_MOVED = 0.02, 0.05, 0.01
-"""Change of a logarithm; the second value holds for the light from beyond the scan, both while the light is steady; the
-third for a light that is new."""
-FIRST_SHARE, DISTANT_SHARE, FIRST_SOLUTIONS = 0.5, 0.2, 10
-"""Of each step for the light from beyond the scan, which pictures tell little of: in so many first solutions, later.
-With whole steps half a voxel's shift turns the real kitchen's light by 13 degrees instead of 8; with .3 at first, what
-four far views of a table show is not caught up with (12 degrees off instead of 10)."""
+MOVED, NEW_MOVED = 0.02, 0.01
+"""Change of a logarithm while the light is steady, and of a light that is new."""
+DISTANT_STEPS, DISTANT_SHARE = 2, 0.5
+"""The light from beyond the scan, of which pictures tell little, takes so many steps a solution, and of each this
+share: a new one keeps a fourth of its prior. After twelve, half a voxel's shift turns the light that one picture of the
+real kitchen shows by 12 degrees instead of 5."""
+FORGOTTEN = 0.05
+"""Share of the way back to its prior at which each of its solutions begins, all of it where the light is another: what
+pictures tell little of does not stay as the first of them had it. In steps alone, where 40 lead to the minimum, the
+light of the real kitchen was 4 to 14 degrees from it in all frames."""
 STILL = 0.005
 """What patches show has not changed while the root mean square of the change of its logarithm is at most this, and a
 solution has settled while its last step's is: half a per cent is less than a code of a picture."""
@@ -53,10 +57,9 @@ class Solver:
     def _begin_anew(self, side_m: float) -> None:
         """Forget all that belongs to rows of patches."""
         self._transport = Transport()
-        self._near, self._distant = Unknowns(), Unknowns()
+        self._near, self._distant = Unknowns(), Unknowns(most_relaxation=DISTANT_SHARE)
         self._last: Solution | None = None
         self._side_m = side_m
-        self._solutions = 0
 
     def solve(
         self, patches: Patches, bright: EmittersSeen, traced: NDArray[np.int64], camera: Floats, up: Floats
@@ -83,19 +86,31 @@ class Solver:
             self._transport, closed, shell.axes[2], evidence.rows, with_indirect=switches.indirect
         )
         first = patches.outdated if self._near.known > 0 and switches.memory else 1.0
-        share = FIRST_SHARE if self._solutions < FIRST_SOLUTIONS else DISTANT_SHARE
-        self._distant.most_relaxation = share ** (1 - patches.outdated)
-        self._solutions += 1
         change = self._last.change_in(patches) if self._last else np.inf
         moved = MOVED * float(np.clip(change / STILL, STILL / MOVED, 1.0))
-        for unknowns, sources, steady in ((self._near, near, moved), (self._distant, distant, DISTANT_MOVED)):
-            settled = steady ** (1 - first) * NEW_MOVED**first
-            unknowns.relaxation = max(unknowns.relaxation, patches.outdated)
-            for number in range(MOST_STEPS):
-                step(unknowns, evidence, sources, switches, with_chroma=number == 0 or unknowns.step > CHROMA_MOVED)
-                if unknowns.step < settled:
-                    break
+        self._solve_near(evidence, near, moved ** (1 - first) * NEW_MOVED**first, patches.outdated)
+        contact = CONTACT_NOISE**2 * self._transport.near[evidence.rows]
+        self._solve_distant(evidence.with_noise(contact), distant, patches.outdated)
         hidden, shown = dict(self._transport.hidden), patches.logarithms[rows]
         solved = self._near.solved(), self._distant.solved(LOBES)
         self._last = Solution(shell, hidden, bright.emitters, *solved, rows, shown)
         return self._last
+
+    def _solve_near(self, evidence: Evidence, sources: Sources, settled: float, outdated: float) -> None:
+        """Steps until one changes what patches receive by less than `settled`."""
+        unknowns = self._near
+        unknowns.relaxation = max(unknowns.relaxation, outdated)
+        for number in range(MOST_STEPS):
+            with_chroma = number == 0 or unknowns.step > CHROMA_MOVED
+            step(unknowns, evidence, sources, self._switches, with_chroma=with_chroma)
+            if unknowns.step < settled:
+                break
+
+    def _solve_distant(self, evidence: Evidence, sources: Sources, outdated: float) -> None:
+        """DISTANT_STEPS, from nearer to the prior. The unknowns' step becomes the change since the last solution."""
+        unknowns = self._distant
+        before = received(unknowns, sources)
+        unknowns.forget(FORGOTTEN ** (1 - outdated), sources, self._switches)
+        for number in range(DISTANT_STEPS):
+            step(unknowns, evidence, sources, self._switches, with_chroma=number == 0)
+        unknowns.step = float(np.sqrt(np.mean((received(unknowns, sources) - before) ** 2)))

@@ -30,6 +30,8 @@ COLUMNS = CELLS + MOST_HIDDEN
 KNOWN, NO_CELL = -1, -2
 """Values in place of a cell: KNOWN is photographed surface; NO_CELL is hidden or saturated surface from which no patch
 has received light."""
+NEAR_SIDES = 2 / 3
+"""Surface within so many sides of a patch is near it: of PATCH_M, .1 m."""
 _MIDDLE = 1 << 19  # half the cells along an axis: 150 km
 _AT_ONCE = 64  # patches whose rays are worked on together: 32 768 rays, some MB
 _MOST_COUNTED = 1e4  # rays that the mean of a saturated cell remembers
@@ -66,6 +68,8 @@ class Transport:
         in at."""
         self.known: Floats = np.zeros((MOST_PATCHES, 3))
         """[patches, 3] radiance that known surface brings."""
+        self.near: Floats = np.zeros(MOST_PATCHES)
+        """[patches] share of a patch's cosine-weighted rays that end on surface near it."""
         self.floor: NDArray[np.float32] = np.zeros((SIDE * SIDE, CELLS), np.float32)
         """[SIDE^2, CELLS] share of the shell's cells of the cosine-weighted hemispheres of those of its floor, with
         nothing in between."""
@@ -118,6 +122,8 @@ class Transport:
         self._add_cells(keys, is_saturated=True)
         self._note_clipped(columns_of(self.hidden, keys), arrivals[bright, :3])
         self._note_bright(rows, rows[row[bright]], share[bright], ends[bright])
+        is_near = np.abs(arrivals[:, 3]) < NEAR_SIDES * patches.side_m
+        self.near[rows] = np.bincount(row, share * is_near, len(rows))
         brought = share * ~back
         self.known[rows] = np.stack([np.bincount(row, brought * c, len(rows)) for c in arrivals[:, :3].T], axis=1)
 

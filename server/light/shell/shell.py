@@ -175,8 +175,8 @@ def closed_sides(positions: Floats, normals: Floats, axes: Floats, patch_m: floa
         outward = 1 if is_high else -1
         place, inward = outward * surface[:, axis], -outward * facing[:, axis]
         is_wall = _step((inward - INWARD[0]) / (INWARD[1] - INWARD[0]))
-        is_wall *= _step(2 - _share_behind(place) / BEHIND_WALL)
-        if has_walls or axis == 2:
+        if is_wall.any() and (has_walls or axis == 2):
+            is_wall *= _step(2 - _share_behind(place) / BEHIND_WALL)
             closed[side] = _step(is_wall.sum() * patch_m**2 / CLOSED_M2)
     return closed
 

@@ -15,7 +15,7 @@ from server.light.shell.switches import Switches
 from server.light.shell.transport import NEAR_SIDES, Transport
 from server.maths.light_direction import direction_error_deg
 from tests.scenes.analytic import Floats
-from tests.scenes.shell_room import CAMERA, NO_EMITTERS, OPEN, UP, ShellRoom, make_room, sky
+from tests.scenes.shell_room import CAMERA, NO_EMITTERS, OPEN, SIZE_M, UP, ShellRoom, make_room, sky
 
 
 def solved(solver: Solver, room: ShellRoom) -> Solution:
@@ -97,13 +97,13 @@ def segment(least: Floats) -> Floats:
 
 
 def test_how_much_of_what_a_patch_sees_is_near(rooms: tuple[ShellRoom, ShellRoom]) -> None:
-    """On the floor, beside one wall: rays that end on it within a radius, here of patches as large as they are apart."""
+    """On the floor, beside one wall: rays that end on it within a radius, here of patches of .6 m."""
     patches, transport = rooms[0].patches.copy(), Transport()
     patches.side_m, rows = 4 * PATCH_M, patches.used
     transport.update(patches, NO_EMITTERS, rows, rooms[0].shell)
     positions, normals = patches.positions[rows], patches.normals[rows]
     radius_m = NEAR_SIDES * patches.side_m
-    beside = (normals[:, 2] > 0.9) & (positions[:, 1] > radius_m)
+    beside = (normals[:, 2] > 0.9) & (np.abs(positions[:, 1] - SIZE_M[1] / 2) < SIZE_M[1] / 2 - radius_m)
     near = transport.near[rows][beside]
     np.testing.assert_allclose(near, segment(positions[beside, 0] / radius_m), atol=0.02)
     assert near.max() > 0.1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -44,6 +46,17 @@ def test_the_first_solutions_are_forgotten(rooms: tuple[ShellRoom, ShellRoom]) -
     assert apart[0] < 8  # seen: 3.7; in steps that lead to the minimum alone, 21
     assert apart[2] < 1  # seen: .4; 10
     assert apart[7] < 0.1
+
+
+def test_a_new_solver_makes_up_for_what_it_missed(rooms: tuple[ShellRoom, ShellRoom]) -> None:
+    """Of a room that has been seen for ten frames, not of one that was seen in one."""
+    went_on = Solver(Switches())
+    for _ in range(8):
+        last = solved(went_on, rooms[0])
+    seen_long = replace(rooms[0], patches=rooms[0].patches.copy())
+    seen_long.patches.weights *= 10
+    assert apart_deg(solved(Solver(Switches()), seen_long), last) < 0.5
+    assert apart_deg(solved(Solver(Switches()), rooms[0]), last) > 1.5
 
 
 def test_a_light_that_stays_comes_to_rest(rooms: tuple[ShellRoom, ShellRoom]) -> None:

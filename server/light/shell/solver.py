@@ -26,6 +26,9 @@ DISTANT_STEPS, DISTANT_SHARE = 2, 0.5
 """The light from beyond the scan, of which pictures tell little, takes so many steps a solution, and of each this
 share: a new one keeps a fourth of its prior. After twelve, half a voxel's shift turns the light that one picture of the
 real kitchen shows by 12 degrees instead of 5."""
+MISSED = 4
+"""A solver that is new does the work of so many solutions at most, and of as many as there were frames: one that goes
+on where a room was saved, or in place of a process that died, has nearly the light that one has which was there."""
 FORGOTTEN = 0.05
 """Share of the way back to its prior at which each of its solutions begins, all of it where the light is another: what
 pictures tell little of does not stay as the first of them had it. In steps alone, where 40 lead to the minimum, the
@@ -90,7 +93,8 @@ class Solver:
         moved = MOVED * float(np.clip(change / STILL, STILL / MOVED, 1.0))
         self._solve_near(evidence, near, moved ** (1 - first) * NEW_MOVED**first, patches.outdated)
         contact = CONTACT_NOISE**2 * self._transport.near[evidence.rows]
-        self._solve_distant(evidence.with_noise(contact), distant, patches.outdated)
+        missed = min(int(patches.weights[rows].max()), MISSED) if self._distant.known == 0 else 1
+        self._solve_distant(evidence.with_noise(contact), distant, patches.outdated, max(missed, 1))
         hidden, shown = dict(self._transport.hidden), patches.logarithms[rows]
         solved = self._near.solved(), self._distant.solved(LOBES)
         self._last = Solution(shell, hidden, bright.emitters, *solved, rows, shown)
@@ -106,11 +110,13 @@ class Solver:
             if unknowns.step < settled:
                 break
 
-    def _solve_distant(self, evidence: Evidence, sources: Sources, outdated: float) -> None:
-        """DISTANT_STEPS, from nearer to the prior. The unknowns' step becomes the change since the last solution."""
+    def _solve_distant(self, evidence: Evidence, sources: Sources, outdated: float, times: int) -> None:
+        """DISTANT_STEPS, from nearer to the prior; so many times. Their step becomes the change from the last one."""
         unknowns = self._distant
         before = received(unknowns, sources)
-        unknowns.forget(FORGOTTEN ** (1 - outdated), sources, self._switches)
-        for number in range(DISTANT_STEPS):
-            step(unknowns, evidence, sources, self._switches, with_chroma=number == 0)
+        for number in range(times * DISTANT_STEPS):
+            is_first = number % DISTANT_STEPS == 0
+            if is_first:
+                unknowns.forget(FORGOTTEN ** (1 - outdated), sources, self._switches)
+            step(unknowns, evidence, sources, self._switches, with_chroma=is_first)
         unknowns.step = float(np.sqrt(np.mean((received(unknowns, sources) - before) ** 2)))

@@ -48,7 +48,7 @@ def test_scanned_walls_close_their_sides() -> None:
 
 
 def test_a_patch_more_closes_little() -> None:
-    """Of a chair's back, say. A full wall closes its side whatever is missing of it."""
+    """A full wall closes its side whatever is missing of it."""
     closed = np.array([closed_by(patches_at(0.0, count)) for count in range(1, 40)])
     assert (np.diff(closed) >= 0).all()
     assert closed[0] < 0.08

@@ -33,8 +33,8 @@ WALL_M = 0.3
 """Depth range of the surface of one wall, with the things that hang on it and with bends of the scan."""
 CLOSED_M2 = 0.15
 """A side with at least this area of scanned wall is closed: more than furniture or stray depth that faces the same
-way. It closes little by little: while a patch of a chair's back more closed .15 of a side at once, half a voxel's shift
-turned the light of the real kitchen by 5 degrees."""
+way. It closes little by little: while each patch closed .15 of a side at once, a side of the real kitchen's first
+picture was open in one volume and .45 closed in another."""
 BEHIND_WALL = 0.03
 """Share of the surface that may lie farther out than a wall by more than WALL_M: stray depth, and what is seen through
 a door. With twice as much it is no wall."""

@@ -126,7 +126,7 @@ class Mailbox:
         """
         with self._changed:
             if self._closed:
-                _cancel(message)
+                cancel_order(message)
                 return Receipt(None, 0)
             replaced = self._replace_unread() if isinstance(message, Frame) else None
             self._messages.append(QueuedMessage(message, self._connection))
@@ -199,7 +199,7 @@ class Mailbox:
         with self._changed:
             self._closed = True
             for queued in self._messages:
-                _cancel(queued.message)
+                cancel_order(queued.message)
             self._messages.clear()
             self._changed.notify_all()
 
@@ -227,6 +227,7 @@ class Mailbox:
         return queued
 
 
-def _cancel(message: Frame | Control) -> None:
+def cancel_order(message: Frame | Control) -> None:
+    """Tell whoever waits for an order that nobody fills it. Other messages are left as they are."""
     if isinstance(message, PanoramaOrder | WatcherRequest):
         message.answer.cancel()

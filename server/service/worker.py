@@ -40,7 +40,7 @@ from server.scene.mesh import Mesh
 from server.service.edge.connection import POLICY, UNAUTHORIZED, ClientGone, Refusal
 from server.service.frame_reader import FrameReader
 from server.service.load_shedding import LoadShedding, SamplingRequest
-from server.service.mailbox import Mailbox, PanoramaOrder, QueuedMessage, WatcherRequest
+from server.service.mailbox import Mailbox, PanoramaOrder, QueuedMessage, WatcherRequest, cancel_order
 from server.service.mesh_message import mesh_parts
 from server.service.monitoring.metrics import Metrics
 from server.service.overhead import Overhead
@@ -183,7 +183,11 @@ class Worker:
             self._context.metrics.queue_age_s.observe(queued.age_ms / 1e3)
             self._answer_frame(pipeline, queued.message, queued)
             return
-        self._finish_delivery()
+        try:
+            self._finish_delivery()
+        except BaseException:  # the session ends; the mailbox does not have the message any more
+            cancel_order(queued.message)
+            raise
         self._outbox.answer_to(queued.connection)
         if isinstance(queued.message, RequestMesh):
             self._send_mesh(pipeline, queued.message.request)

@@ -1,6 +1,7 @@
 """Watching clients: whom they see, what they get, and that a slow one slows nobody."""
 
 import asyncio
+import threading
 
 import msgpack
 import pytest
@@ -23,8 +24,10 @@ from protocol.messages import (
     Watch,
     Welcome,
 )
+from server.service import worker
 from server.service.broadcast import Broadcast, Watcher
 from server.service.edge.connection import Refusal
+from server.service.mailbox import Mailbox, WatcherRequest
 from tests.service.fakes import CAMERA, PATIENCE_S, frame_message, rgbd_frame
 from tests.service.wire import Wire
 
@@ -156,6 +159,41 @@ def test_watcher_is_told_that_the_session_ended_before_its_request_was_read(dial
     lab.release()
     said = watcher.hear_until(Acknowledged)[-1].error
     assert said in ("the session has just ended", "no session is streaming that could have objects")
+
+
+def test_watcher_is_told_where_an_answer_that_fails_ends_the_session(dial, lab, monkeypatch) -> None:
+    """The worker has its request in hand then, and waits until the frame before is answered."""
+    is_posted, is_awaited = threading.Event(), threading.Event()
+    post, finish = Mailbox.post, worker.Worker._finish_delivery
+
+    def post_and_tell(mailbox, message):
+        receipt = post(mailbox, message)
+        if isinstance(message, WatcherRequest):
+            is_posted.set()
+        return receipt
+
+    def finish_and_tell(its_worker):
+        if its_worker._delivery is not None:
+            is_awaited.set()
+        finish(its_worker)
+
+    def fail(*_arguments, **_options):
+        assert is_awaited.wait(PATIENCE_S)
+        raise RuntimeError("no such codec")
+
+    monkeypatch.setattr(Mailbox, "post", post_and_tell)
+    monkeypatch.setattr(worker.Worker, "_finish_delivery", finish_and_tell)
+    monkeypatch.setattr(worker, "composite_message", fail)
+    lab.hold = True
+    camera, watcher = dial(), dial()
+    camera.greet()
+    watcher.watch()
+    camera.say(frame_message(1))
+    lab.next_entered()
+    watcher.say(RemoveObject(request=1, object="vase"))
+    assert is_posted.wait(PATIENCE_S)
+    lab.release()
+    assert watcher.hear_until(Acknowledged)[-1].error == "the session has just ended"
 
 
 def test_watcher_that_leaves_with_a_request_under_way_disturbs_nobody(dial, lab) -> None:

@@ -147,7 +147,8 @@ def test_watcher_of_nobody_is_told_that_there_is_no_session(dial) -> None:
     assert watcher.hear_until(Acknowledged)[-1].error == "no session is streaming that could have objects"
 
 
-def test_watcher_is_told_that_the_session_ended_before_its_request_was_read(dial, lab) -> None:
+def asking_during_a_frame(dial, lab) -> tuple[Wire, Wire]:
+    """A camera whose frame is held, and a watcher that has asked for something meanwhile."""
     lab.hold = True
     camera, watcher = dial(), dial()
     camera.greet()
@@ -155,6 +156,11 @@ def test_watcher_is_told_that_the_session_ended_before_its_request_was_read(dial
     camera.say(frame_message(1))
     lab.next_entered()
     watcher.say(RemoveObject(request=1, object="vase"))
+    return camera, watcher
+
+
+def test_watcher_is_told_that_the_session_ended_before_its_request_was_read(dial, lab) -> None:
+    camera, watcher = asking_during_a_frame(dial, lab)
     camera.say(Bye())
     lab.release()
     said = watcher.hear_until(Acknowledged)[-1].error
@@ -184,13 +190,7 @@ def test_watcher_is_told_where_an_answer_that_fails_ends_the_session(dial, lab, 
     monkeypatch.setattr(Mailbox, "post", post_and_tell)
     monkeypatch.setattr(worker.Worker, "_finish_delivery", finish_and_tell)
     monkeypatch.setattr(worker, "composite_message", fail)
-    lab.hold = True
-    camera, watcher = dial(), dial()
-    camera.greet()
-    watcher.watch()
-    camera.say(frame_message(1))
-    lab.next_entered()
-    watcher.say(RemoveObject(request=1, object="vase"))
+    _, watcher = asking_during_a_frame(dial, lab)
     assert is_posted.wait(PATIENCE_S)
     lab.release()
     assert watcher.hear_until(Acknowledged)[-1].error == "the session has just ended"

@@ -234,7 +234,7 @@ def received(unknowns: Unknowns, sources: Sources) -> Floats:
 
 
 def _known(sources: Sources) -> tuple[Floats, Floats]:
-    """[n, 3] log chroma of what photographed surface brings, and [n] its mean level."""
+    """[n, 3] as of log_chroma of what photographed surface brings, and [n] its level; 0 where there is none."""
     logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
     return logs, np.where(sources.known.max(axis=1) > 0, np.exp(logs[:, 0]), 0.0)
 

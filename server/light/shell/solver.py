@@ -26,7 +26,7 @@ DISTANT_STEPS, DISTANT_SHARE = 2, 0.5
 """The light from beyond the scan, of which pictures tell little, takes so many steps a solution, and of each this
 share: a new one keeps a fourth of its prior. After twelve, half a voxel's shift turns the light that one picture of the
 real kitchen shows by 12 degrees instead of 5."""
-MISSED = 4
+MOST_MISSED = 4
 """A solver that is new does the work of so many solutions at most, and of as many as there were frames: one that goes
 on where a room was saved, or in place of a process that died, has nearly the light that one has which was there."""
 FORGOTTEN = 0.05
@@ -93,8 +93,8 @@ class Solver:
         moved = MOVED * float(np.clip(change / STILL, STILL / MOVED, 1.0))
         self._solve_near(evidence, near, moved ** (1 - first) * NEW_MOVED**first, patches.outdated)
         contact = CONTACT_NOISE**2 * self._transport.near[evidence.rows]
-        missed = min(int(patches.weights[rows].max()), MISSED) if self._distant.known == 0 else 1
-        self._solve_distant(evidence.with_noise(contact), distant, patches.outdated, max(missed, 1))
+        frames = int(patches.weights[rows].max()) if self._distant.known == 0 else 1
+        self._solve_distant(evidence.with_noise(contact), distant, patches.outdated, min(max(frames, 1), MOST_MISSED))
         hidden, shown = dict(self._transport.hidden), patches.logarithms[rows]
         solved = self._near.solved(), self._distant.solved(LOBES)
         self._last = Solution(shell, hidden, bright.emitters, *solved, rows, shown)

@@ -7,7 +7,7 @@ import pytest
 
 from server.light.shell import weights
 from server.light.shell.distant import distant_light
-from server.light.shell.evidence import DARKEST, log_chroma, materials_of
+from server.light.shell.evidence import DARKEST, LOG_CHROMA, log_chroma, materials_of
 from server.light.shell.objective import Unknowns, step
 from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights
 from server.light.shell.shell import (
@@ -209,6 +209,22 @@ def test_the_chroma_is_a_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
         lower, higher = (value(unknowns.chroma + move) for move in moves)
         slope, bend = (higher - lower) / 0.1, (higher + lower - 2 * best) / 0.05**2
         assert abs(slope / bend) < 0.006  # seen: .003
+
+
+def test_a_cast_is_the_lights_sooner_if_it_is_like_a_black_bodys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nothing is known to be white, a room and its light share a cast: of a green one the light takes less."""
+    monkeypatch.setattr(weights, "WHITE_CHROMA_SPREAD", 10.0)
+    across = np.array([weights.TINT_AXIS[1], -weights.TINT_AXIS[0]])
+    taken = []
+    for axis in (-weights.TINT_AXIS, -across):
+        color = np.exp(np.linalg.inv(LOG_CHROMA) @ [0.0, *(0.3 * axis)])
+        room = make_room(None, tuple(color))
+        room.solve(30)
+        parts = room.near.shares @ np.exp(room.unknowns.z)
+        found = (room.near.shares * np.exp(room.unknowns.z) / parts[:, None]) @ room.unknowns.chroma
+        taken.append(float(found.mean(axis=0) @ axis) / 0.3)
+    assert taken[0] > 2 * taken[1], taken
+    assert taken[1] > 0, taken
 
 
 def spoilt(case: str) -> ShellRoom:

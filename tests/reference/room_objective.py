@@ -83,9 +83,11 @@ def chroma_objective(
     """
     residual = seen - parts @ chroma
     total = sum(_of_surface(residual[surfaces == f], regions[surfaces == f]) for f in np.unique(surfaces))
-    pull, weight = 1 / constants.CELL_CHROMA**2, 1 / constants.TINT**2
-    tint = pull * chroma.sum(axis=0) / (pull * len(chroma) + weight)
-    total += pull * ((chroma - tint) ** 2).sum() + weight * (tint**2).sum()
+    red, blue = constants.TINT_AXIS
+    pull, weight = 1 / constants.CELL_CHROMA**2, 1 / np.array([constants.TINT, constants.TINT_ACROSS]) ** 2
+    turned = chroma @ np.array([[red, blue], [blue, -red]])  # along the colours of black bodies, and across
+    tint = pull * turned.sum(axis=0) / (pull * len(chroma) + weight)
+    total += pull * ((turned - tint) ** 2).sum() + (weight * tint**2).sum()
     for first, second in neighbours():
         total += constants.CHROMA_SMOOTHNESS * ((chroma[first] - chroma[second]) ** 2).sum()
     white = residual[brightest].mean(axis=0) - constants.WHITE_CHROMA

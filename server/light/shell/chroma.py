@@ -43,10 +43,21 @@ def solve_chroma(
         vector += weight * np.outer(sees, seen[brightest].mean(axis=0) - weights.WHITE_CHROMA).astype(np.float32)
     add_smoothness(matrix, pairs, weights.CHROMA_SMOOTHNESS)
     matrix[np.diag_indices_from(matrix)] += 1 / weights.CELL_CHROMA**2
-    # The light's own chroma t is eliminated: u about t, t about 0.
+    across = np.array([weights.TINT_AXIS[1], -weights.TINT_AXIS[0]])
+    return _with_tint(matrix, vector, weights.TINT_AXIS, weights.TINT) + _with_tint(
+        matrix, vector, across, weights.TINT_ACROSS
+    )
+
+
+def _with_tint(matrix: Singles, vector: Singles, axis: Floats, spread: float) -> Floats:
+    """[k, 2] the part along the unit `axis` [2] of chroma u, where all of it lies about the light's own, t.
+
+    t is eliminated: along the axis it lies about 0 with standard deviation `spread`.
+    """
     pull = 1 / weights.CELL_CHROMA**2
-    matrix -= np.float32(pull**2 / (parts.shape[1] * pull + 1 / weights.TINT**2))
-    return lu_solve(lu_factor(matrix, check_finite=False), vector, check_finite=False).astype(np.float64)  # type: ignore[no-any-return]
+    factors = lu_factor(matrix - np.float32(pull**2 / (len(matrix) * pull + 1 / spread**2)), check_finite=False)
+    along = lu_solve(factors, (vector @ axis).astype(np.float32), check_finite=False)
+    return np.outer(along, axis).astype(np.float64)
 
 
 def _albedo_offsets(regions: Regions, residuals: Floats, *, finds_albedos: bool) -> Offsets:

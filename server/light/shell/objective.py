@@ -25,8 +25,9 @@ between, plus the mean log albedo of floor that was; of all others it is one val
 the lobe's elevation.
 b is the log albedo of the brightest white surface, the mean of log s(B_p m) + o_f(p) between two ranks of patches that
 count as their chroma is like w_0, white paint's; it sets the level. w is the mean chroma of albedo of the patches, of
-any chroma, between these ranks; for the light from beyond the scan, b and w are left out, tau is quadratic above 0, and
-S_p^2 is larger by what is near the patch (CONTACT_NOISE).
+any chroma, between these ranks. s_t is one along the colours of black bodies, another across them. For the light from
+beyond the scan, b and w are left out, tau is quadratic above 0, and S_p^2 is larger by what is near the patch
+(CONTACT_NOISE).
 n_k and m follow between the steps, m from its own two terms: all materials, and b, go along with it, since little else
 of the objective changes where all albedo grows and all light falls. The weights stand in weights.py. A patch that is
 clipped only counts where (1) is below what it shows; its material is the mean one.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 SIDE = 7
 """Cells along an edge of a face: of half a metre in a room. With 5 to 9, rooms' medians change by a degree or two
-(docs/light.md)."""
+(docs/light_experiments.md)."""
 SIDES = 6
 """In the order -x, +x, -y, +y, -z, +z of the shell's axes."""
 CELLS = SIDES * SIDE * SIDE

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 SPREAD_DOUBT, LEAST_SPREAD_DEG = 2.0, 12.0
 """Standard deviations over what the curvature tells of them, and the angle that a cell's size leaves unknown: so that
-90 % of directions are within the spread in each of the rooms r1, r3 and r4 (docs/light.md)."""
+90 % of directions are within the spread in each of the rooms r1, r3 and r4 (docs/light_experiments.md)."""
 _QUANTILE_90 = 2.146  # radius that holds 90 % of a two-dimensional normal distribution
 _LINEAR = [3, 1, 2]  # x, y, z
 

@@ -65,7 +65,7 @@ are as many minima: a picture less turned the light of the real kitchen by 31 de
 LOBE_UP = 0.5
 """By how much the logarithm of the most probable radiance grows with the sine of elevation, for light comes from above:
 fitted to the medians of four environment maps it is .2, .6, .8 and 1.2, to the first band of ten published lights .5 to
-3. Less than that, since with 1 lamps that stand beside a scan are found too high (docs/light.md)."""
+3. Less than that, since with 1 lamps that stand beside a scan are found too high (docs/light_experiments.md)."""
 LIT_EXCESS, LIT_SPREAD = 0.2, 1.0
 """For saturated surface that may be lit paint: mean radiance beyond what the picture shows, relative to that, and the
 standard deviation of its log."""
@@ -86,8 +86,13 @@ In thirteen rooms the true one is .05 and -.12 in the mean and differs by .07 an
 WHITE_TOLERANCE, NOT_WHITE = 0.2, 0.02
 """Deviation of chroma from white's by which surface counts less as white where the level is found, and how much that of
 any chroma counts: it decides where nothing is white."""
-CELL_CHROMA, TINT = 0.3, 0.3
-"""Standard deviations of a cell's chroma about the light's, and of the light's about grey: lamps are warm, skies blue,
-but cameras balance white."""
+CELL_CHROMA = 0.3
+"""Standard deviation of a cell's chroma about the light's."""
+TINT_AXIS = np.array([-0.46, 1.0]) / np.hypot(-0.46, 1.0)
+"""[2] unit: along the colours of black bodies, from 4000 to 12000 K in linear sRGB. Lamps are warm, skies blue, and
+neither is green."""
+TINT, TINT_ACROSS = 0.45, 0.08
+"""Standard deviations of the light's chroma about grey, along that axis and across it: in fifteen rooms the true one is
+.44 and .08 from grey, root mean square."""
 CHROMA_SMOOTHNESS = 5.0
 """Weight of the squared difference of neighbouring cells' chroma."""

@@ -171,10 +171,11 @@ class Mailbox:
                     to(queued.message)
                     return
 
-    def has_message(self) -> bool:
-        """Whether `take` would not wait."""
+    def wait_or(self, other: Future[None]) -> None:
+        """The reader waits until `take` would not wait, or `other` is done."""
+        other.add_done_callback(lambda _: self._wake())
         with self._changed:
-            return bool(self._messages) or self._closed
+            self._changed.wait_for(lambda: self._messages or self._closed or other.done())
 
     def is_idle(self) -> bool:
         """Whether nothing is unread and the reader has finished the last message: it waits for another one."""
@@ -193,6 +194,10 @@ class Mailbox:
         with self._changed:
             self._connection += 1
             self._unanswered = self._frames_ahead = 0
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify()
 
     def close(self) -> None:
         """Discard unread messages and wake the reader."""

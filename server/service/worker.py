@@ -161,9 +161,11 @@ class Worker:
         self._mailbox.show_next_frame(self._frames.begin)
 
     def _take(self) -> QueuedMessage | None:
-        """The next message; while none is there, all that came before is answered."""
-        if not self._mailbox.has_message():
-            self._finish_delivery()
+        """The next message, which may come while the newest frame is being answered. Raises what that raised."""
+        if self._delivery is not None:
+            self._mailbox.wait_or(self._delivery)
+            if self._delivery.done():
+                self._finish_delivery()
         return self._mailbox.take()
 
     def _finish_delivery(self) -> None:

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from concurrent.futures import Future
 
 import msgspec
 import pytest
@@ -107,6 +108,19 @@ def test_take_waits_for_a_letter() -> None:
     mailbox.post(quality(7))
     thread.join(PATIENCE_S)
     assert taken == [quality(7)]
+
+
+@pytest.mark.parametrize("what_comes", ["a message", "the other", "closing"])
+def test_a_reader_waits_for_a_message_or_something_else(what_comes: str) -> None:
+    mailbox, other = Mailbox(2), Future()
+    ways = {"a message": lambda: mailbox.post(quality(7)), "the other": lambda: other.set_result(None)}
+    thread = threading.Thread(target=mailbox.wait_or, args=(other,))
+    thread.start()
+    thread.join(0.05)
+    assert thread.is_alive()
+    ways.get(what_comes, mailbox.close)()
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
 
 
 def test_close_lets_a_waiting_reader_go_and_forgets_letters() -> None:

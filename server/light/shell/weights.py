@@ -93,6 +93,6 @@ TINT_AXIS = np.array([-0.46, 1.0]) / np.hypot(-0.46, 1.0)
 neither is green."""
 TINT, TINT_ACROSS = 0.45, 0.08
 """Standard deviations of the light's chroma about grey, along that axis and across it: in fifteen rooms the true one is
-.44 and .08 from grey, root mean square."""
+.44 and .09 from grey, root mean square."""
 CHROMA_SMOOTHNESS = 5.0
 """Weight of the squared difference of neighbouring cells' chroma."""

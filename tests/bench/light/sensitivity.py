@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 ROOMS = ("r1_ceiling", "r3_two")
 AT_ONCE = 2
 """Measurements that run beside each other."""
@@ -83,13 +85,11 @@ def set_before_import(constant: Constant, value: Value) -> None:
     module = importlib.import_module(name)
     if not hasattr(module, constant.name):
         raise RuntimeError(f"{name} has no {constant.name}")
-    setattr(module, constant.name, importlib.import_module("numpy").array(value) if isinstance(value, tuple) else value)
+    setattr(module, constant.name, np.array(value) if isinstance(value, tuple) else value)
 
 
 def measure(rooms: list[str]) -> list[list[float]]:
     """Medians in each room, without virtual objects, in the order of the text above."""
-    import numpy as np
-
     from server.children import process_pool
 
     process_pool.IS_SUPPORTED = False  # a solver in another process would not have the value

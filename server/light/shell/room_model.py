@@ -24,6 +24,7 @@ from server.light.light_estimation import LightEstimate
 from server.light.shell.beside import Beside
 from server.light.shell.bright_surface import BrightSurface, TracedEmitters
 from server.light.shell.distant import distant_light
+from server.light.shell.fade import Fade, Told
 from server.light.shell.known_room import KnownRoom
 from server.light.shell.objective import Unknowns
 from server.light.shell.patches import Patches, TracedPatches, patch_side_m
@@ -83,7 +84,7 @@ class RoomModel:
         self._picture: PatchesInPicture | None = None
         self._tracing: _Tracing | None = None
         self._begun_with: Shell | None = None
-        self._waiting = self._frames = 0
+        self._waiting = self._frames = self._steady = 0
         self._is_urgent = False
 
     @property
@@ -128,6 +129,7 @@ class RoomModel:
         self._keep_side(volume.voxel_m)
         self._bright.add(seen.bright, seen.positions)
         self._waiting, self._frames = self._waiting + 1, self._frames + 1
+        self._steady = 1 if change > 0.0 else self._steady + 1
         self._is_urgent = self._is_urgent or self._must_follow(change)
         waits = context.waits_for_light or self._solution is None
         if not waits and not self._is_ready:
@@ -166,7 +168,8 @@ class RoomModel:
         self._patches.end_trace(tracing.patches, of_patches)
         self._bright.end_trace(tracing.volume, tracing.emitters, of_emitters)
         patches, bright = self._patches.copy(), self._bright.seen_by()
-        task = Task(patches, bright, tracing.patches.rows, tracing.camera, tracing.up, self._asked())
+        fade = Fade(Told.by(self._solution), SOLVE_EVERY / self._steady)
+        task = Task(patches, bright, tracing.patches.rows, tracing.camera, tracing.up, self._asked(), fade)
         self._next = Beside(partial(self._solver.solve, task))
 
     def close(self) -> None:
@@ -197,7 +200,7 @@ class RoomModel:
         if solution is None or self._patches.fresh > 0:
             return False
         change = solution.change_in(self._patches)
-        return max(change, solution.near.step, solution.distant.step) <= STILL
+        return solution.behind == 0.0 and max(change, solution.near.step, solution.distant.step) <= STILL
 
     def estimate(self, bands: int) -> LightEstimate:
         """The light from beyond the scan."""

@@ -94,6 +94,11 @@ class Shell:
         cells, shape = cell[:, None] + np.array([0, 1, SIDE, SIDE + 1]), (*points.shape[:-1], CORNERS)
         return cells.reshape(shape), shares.reshape(shape)
 
+    def has_size_of(self, other: Shell) -> bool:
+        """Whether both are the same box."""
+        mine, others = (self.axes, self.low, self.high), (other.axes, other.low, other.high)
+        return all(np.array_equal(one, two) for one, two in zip(mine, others, strict=True))
+
     @cached_property
     def centers(self) -> Floats:
         """[CELLS, 3] middles of the cells along `axes`, metres."""

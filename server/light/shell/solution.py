@@ -74,6 +74,8 @@ class Solution:
     """[n] of the patches that it explains."""
     shown: Floats
     """[n, 3] mean log radiance of these patches."""
+    behind: float = 0.0
+    """By what share the light that it tells differs from the one that was solved (fade.py)."""
     _beyond: dict[tuple[bytes, int], tuple[Floats, Floats, list[ShellLamp]]] = field(default_factory=dict)
     """What `beyond` found last."""
     _estimates: dict[int, LightEstimate] = field(default_factory=dict)
@@ -115,6 +117,10 @@ class Solution:
             self._beyond[asked] = self._seen_beyond(positions, bands)
         return self._beyond[asked]
 
+    def beyond_at(self, position: Floats) -> Floats:
+        """[BANDS^2, 3] the whole of `beyond` at one position [3]."""
+        return self._whole(position, self._sent_by_shell(position)[1], BANDS)
+
     def estimate(self, bands: int) -> LightEstimate:
         """The light from beyond the scan, the same for all places."""
         if bands not in self._estimates:
@@ -131,11 +137,15 @@ class Solution:
         whole, rest = [], []
         for position in positions:
             ends, radiance, _ = self._sent_by_shell(position)
-            towards = sh_basis(self.emitters.seen_from(position[None])[0][0], bands)
-            from_emitters = towards.T @ (self._emitting_angles(position)[:, None] * sent)
-            whole.append(_basis(bands) @ radiance + from_emitters)
+            whole.append(self._whole(position, radiance, bands))
             rest.append(_basis(bands) @ parts.rest(ends, radiance))
         return np.array(whole), np.array(rest), [*emitting, *lamps]
+
+    def _whole(self, position: Floats, from_shell: Floats, bands: int) -> Floats:
+        """[bands^2, 3] of the shell and the emitters. from_shell: [DIRECTIONS, 3]."""
+        towards = sh_basis(self.emitters.seen_from(position[None])[0][0], bands)
+        from_emitters = towards.T @ (self._emitting_angles(position)[:, None] * self._sent_by_emitters)
+        return np.asarray(_basis(bands) @ from_shell + from_emitters)
 
     def _sent_by_shell(self, position: Floats) -> tuple[Floats, Floats, Floats]:
         """[DIRECTIONS, 3] where look-up directions from `position` end on the shell, its radiance, likewise, and

@@ -13,7 +13,7 @@ import threading
 import weakref
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from server.children.nursery import ChildDied, JobSpec, Nursery
 from server.children.process_pool import IS_SUPPORTED, ChildProcess
 from server.light.shell.bright_surface import EmittersSeen
+from server.light.shell.fade import Fade
 from server.light.shell.patches import Patches
 from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
@@ -69,13 +70,17 @@ class Task:
     up: Floats
     """[3] unit, world."""
     asked: Asked
+    fade: Fade
 
     def solve(self, solver: Solver) -> Solution | None:
-        """With what is asked of it; None where too few patches are known."""
+        """As it is told, with what is asked of it; None where too few patches are known."""
         solution = solver.solve(self.patches, self.bright, self.traced, self.camera, self.up)
-        if solution is not None:
-            self.asked.find(solution)
-        return solution
+        if solution is None:
+            return None
+        asked = self.asked.positions
+        told = self.fade.told(solution, self.camera if asked is None else asked.mean(axis=0))
+        self.asked.find(told)
+        return told
 
     def without_known_rays(self, known: bool) -> Task:
         """For a child that has the rays of all other patches, if it is `known` to: those of `traced` alone are in it,
@@ -83,7 +88,7 @@ class Task:
         rows = self.traced if known else self.patches.used
         patches = copy(self.patches)
         patches.arrivals = patches.arrivals[rows]
-        return Task(patches, self.bright, rows, self.camera, self.up, self.asked)
+        return replace(self, patches=patches, traced=rows)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,8 @@ HALVES_FRAMES = range(0, 240, 24)
 HALVES_GOAL_DEG = 5
 KITCHEN, KITCHEN_FRAMES, QUICK_KITCHEN_FRAMES = "rgbd_7scenes_redkitchen", 200, 40
 FLICKER_GOAL_DEG = 2
+FLICKER_FROM = 30
+"""Frames until the room has been looked at for a second."""
 KITCHEN_UP = np.array([0.010, -0.888, -0.460])
 """[3] world: the normal of its table and its floor."""
 MUG_FRAME, MUG_PX = 20, (400, 193)
@@ -79,6 +81,10 @@ def kitchen_part(run: Run) -> Part:
     last, exposure = found[-1], found[MUG_FRAME].light.exposure
     part.add("kitchen: colour of the light on a white mug, off the mug's own by", 100 * mug.off_by(last), "%")
     part.add("kitchen: albedo of the white mug under that light", mug.albedo_under(last, exposure), "", "<= 0.95")
+    changes = 100 * _changes_at_place(found[FLICKER_FROM:])
+    row = f"kitchen: light at the mug, frame to frame from frame {FLICKER_FROM} on"
+    part.add(f"{row}, root mean square", float(np.sqrt((changes**2).mean())), "%")
+    part.add(f"{row}, greatest", float(changes.max()), "%")
     view = last.world_from_camera[:3, 2].tolist()
     part.details = {"light": light_in(last).tolist(), "up": list(map(float, up)), "view": view}
     return part
@@ -119,8 +125,19 @@ class _Mug:
 
     def _shading(self, result: FrameResult) -> Floats:
         """[3] of a white surface that faces as its side does, as exposed in that frame."""
-        sh = next(np.array(lit.sh) for lit in result.light.at if lit.of == "place")
+        sh = _light_at_place(result)
         return np.asarray((lambert_transfer(self.normal[None], math.isqrt(len(sh))) @ sh)[0])
+
+
+def _light_at_place(result: FrameResult) -> Floats:
+    """[16, 3] at the place that was asked for, as exposed in that frame."""
+    return next(np.array(lit.sh) for lit in result.light.at if lit.of == "place")
+
+
+def _changes_at_place(found: list[FrameResult]) -> Floats:
+    """[frames - 1] difference of two lights in a row, over the first: norms of all coefficients, exposure apart."""
+    lights = np.array([_light_at_place(result) / result.light.exposure for result in found])
+    return np.asarray(np.linalg.norm(np.diff(lights, axis=0), axis=(1, 2)) / np.linalg.norm(lights[:-1], axis=(1, 2)))
 
 
 def _add_turns(

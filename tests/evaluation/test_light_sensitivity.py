@@ -15,7 +15,7 @@ from tests.bench.light.sensitivity import CONSTANTS, Constant, set_before_import
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "light.md"
-ELSEWHERE = ("solver", "transport")
+ELSEWHERE = ("solver", "transport", "fade")
 """Modules with constants that the page lists besides those of CONSTANTS."""
 
 

@@ -103,6 +103,14 @@ def test_a_wall_that_is_found_elsewhere_does_not_move_what_is_seen() -> None:
     assert change(before, by_cell) > 0.2, "seen: .22, with what each cell had told"
 
 
+def test_a_place_in_the_middle_of_a_cell() -> None:
+    """Has no direction to it."""
+    goal = solved(26, shell=replace(ROOM, high=ROOM.high - np.array([0.0, 0.0, 0.5])))
+    told = Fade(Told.by(solved(24)), 0.0).told(goal, goal.shell.centers[CEILING + 5])
+    assert np.isfinite(told.near.radiance).all()
+    assert np.isfinite(told.behind)
+
+
 def test_what_is_asked_of_it_is_of_what_it_tells() -> None:
     """Nothing that was found of the solution before is left in it."""
     goal = solved(26)

@@ -85,5 +85,6 @@ def _turned(before: Told, shell: Shell, place: Floats) -> Floats:
     if shell.has_size_of(before.shell):
         return sent
     towards = shell.centers @ shell.axes - place
+    towards[np.abs(towards).max(axis=1) < 1e-6] = shell.axes[2]  # of a cell that the place lies in the middle of
     cells, shares = before.shell.exits(np.broadcast_to(place, towards.shape), towards)
     return np.asarray(np.einsum("mc,mcr->mr", shares, sent[cells]))

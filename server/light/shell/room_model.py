@@ -48,8 +48,8 @@ LATEST_S = 0.5
 """A live frame waits all the same for a solution that began so long ago, and SOLVE_EVERY frames: on a processor that
 has too much to do the light would never be a new one. A person sees light that is later."""
 NEW_SHARE = 0.1
-"""If the share of new patches, or of frames under this light that are not in the solution, is at least this, a frame is
-solved at once."""
+"""If the share of new patches, or of frames of which the evidence is that are not in the solution, is at least this, a
+frame is solved at once."""
 LEAST_FACING = 8
 """Least number of patches that face one way, for a median."""
 
@@ -86,8 +86,10 @@ class RoomModel:
         self._begun_with: Shell | None = None
         self._waiting = 0
         """Frames since the last solution was begun."""
-        self._frames = 0
-        """Frames under the same light."""
+        self._frames = 0.0
+        """Of which the evidence is: fewer, where the light has changed."""
+        self._kept = 1.0
+        """Share of the evidence of the last solution that a change has left."""
         self._is_urgent = False
 
     @property
@@ -131,7 +133,8 @@ class RoomModel:
         self._patches.add(seen)
         self._keep_side(volume.voxel_m)
         self._bright.add(seen.bright, seen.positions)
-        self._waiting, self._frames = self._waiting + 1, 1 if change > 0.0 else self._frames + 1
+        self._waiting, self._frames = self._waiting + 1, (1 - change) * self._frames + 1
+        self._kept *= 1 - change
         self._is_urgent = self._is_urgent or self._must_follow(change)
         waits = context.waits_for_light or self._solution is None
         if not waits and not self._is_ready:
@@ -170,19 +173,17 @@ class RoomModel:
         self._patches.end_trace(tracing.patches, of_patches)
         self._bright.end_trace(tracing.volume, tracing.emitters, of_emitters)
         patches, bright = self._patches.copy(), self._bright.seen_by()
-        fade = Fade(Told.by(self._solution), self._new_share)
+        fade = Fade(Told.by(self._solution), self._new_share())
         task = Task(patches, bright, tracing.patches.rows, tracing.camera, tracing.up, self._asked(), fade)
-        self._next = Beside(partial(self._solver.solve, task))
+        self._next, self._kept = Beside(partial(self._solver.solve, task)), 1.0
 
     def close(self) -> None:
         """End what is worked out beside the frames."""
         self._solver.close()
 
-    @property
     def _new_share(self) -> float:
-        """Of the evidence, since the last solution; all, while the light is as young as frames that are solved at
-        once."""
-        return SOLVE_EVERY / self._frames if NEW_SHARE * self._frames > 1 else 1.0
+        """Of the evidence, since the last solution; 1 while every frame is solved at once."""
+        return 1.0 if NEW_SHARE * self._frames <= 1 else 1 - self._kept + SOLVE_EVERY / self._frames
 
     @property
     def _is_ready(self) -> bool:

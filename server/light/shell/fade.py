@@ -45,13 +45,13 @@ class Fade:
     """How the next solution is told."""
 
     before: Told | None
-    """None: it is told as it is."""
+    """None: it is told as it is, since the light is young or another one."""
     new: float
-    """Share of the evidence that is new; from 1 on the light is another one, and told as it is."""
+    """Share of the evidence that is new to it."""
 
     def told(self, solution: Solution, place: Floats) -> Solution:
         """`solution`, or on the way to it from the last one, as seen from `place` [3] (world)."""
-        if self.before is None or self.new >= 1.0:
+        if self.before is None:
             return solution
         held = _with_radiance(solution, _carried(self.before, solution, place))
         light, last = (one.beyond_at(place) @ LUMINANCE for one in (solution, held))

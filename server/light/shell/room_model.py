@@ -49,7 +49,7 @@ LATEST_S = 0.5
 has too much to do the light would never be a new one. A person sees light that is later."""
 NEW_SHARE = 0.1
 """If the share of new patches, or of frames of which the evidence is that are not in the solution, is at least this, a
-frame is solved at once."""
+frame is solved at once; if that of the evidence that is new to a solution is, it is told as it is."""
 LEAST_FACING = 8
 """Least number of patches that face one way, for a median."""
 
@@ -173,17 +173,14 @@ class RoomModel:
         self._patches.end_trace(tracing.patches, of_patches)
         self._bright.end_trace(tracing.volume, tracing.emitters, of_emitters)
         patches, bright = self._patches.copy(), self._bright.seen_by()
-        fade = Fade(Told.by(self._solution), self._new_share())
+        new = 1 - self._kept + SOLVE_EVERY / self._frames
+        fade = Fade(None if new >= NEW_SHARE else Told.by(self._solution), new)
         task = Task(patches, bright, tracing.patches.rows, tracing.camera, tracing.up, self._asked(), fade)
         self._next, self._kept = Beside(partial(self._solver.solve, task)), 1.0
 
     def close(self) -> None:
         """End what is worked out beside the frames."""
         self._solver.close()
-
-    def _new_share(self) -> float:
-        """Of the evidence, since the last solution; 1 while every frame is solved at once."""
-        return 1.0 if NEW_SHARE * self._frames <= 1 else 1 - self._kept + SOLVE_EVERY / self._frames
 
     @property
     def _is_ready(self) -> bool:

@@ -22,11 +22,10 @@ HIDDEN = {77: CELLS, 99: CELLS + 1}
 """Keys of two pieces of hidden surface, and their columns."""
 
 
-def solved(lamp: int, radiance: float = 60.0, shell: Shell = ROOM, hidden: dict[int, int] | None = None) -> Solution:
+def solved(lamp: int, shell: Shell = ROOM, hidden: dict[int, int] = HIDDEN) -> Solution:
     """A dim room with a lamp in one cell of its ceiling."""
-    hidden = HIDDEN if hidden is None else hidden
     sent = np.full((CELLS + len(hidden), 3), [0.3, 0.3, 0.25])
-    sent[CEILING + lamp] = radiance
+    sent[CEILING + lamp] = 60.0
     near = Solved(sent, np.eye(len(sent), dtype=np.float32), 1.0, 0.0, 0.0)
     rows = np.zeros(0, np.int64)
     return Solution(shell, hidden, BrightSurface().seen_by().emitters, near, near, rows, np.zeros((0, 3)))

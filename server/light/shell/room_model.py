@@ -48,8 +48,8 @@ LATEST_S = 0.5
 """A live frame waits all the same for a solution that began so long ago, and SOLVE_EVERY frames: on a processor that
 has too much to do the light would never be a new one. A person sees light that is later."""
 NEW_SHARE = 0.1
-"""If the share of new patches, or of frames of which the evidence is that are not in the solution, is at least this, a
-frame is solved at once; if that of the evidence that is new to a solution is, it is told as it is."""
+"""With this share of new patches, or of frames since the last solution, a frame is solved at once. A solution with this
+share of new evidence is told as it is."""
 LEAST_FACING = 8
 """Least number of patches that face one way, for a median."""
 
@@ -87,7 +87,7 @@ class RoomModel:
         self._waiting = 0
         """Frames since the last solution was begun."""
         self._frames = 0.0
-        """Of which the evidence is: fewer, where the light has changed."""
+        """That the evidence is worth: fewer once the light has changed."""
         self._kept = 1.0
         """Share of the evidence of the last solution that a change has left."""
         self._is_urgent = False

@@ -58,7 +58,7 @@ from tests.bench.rendering.turning import (
 )
 from tests.bench.report.finished import Part, UnmeasurableError
 from tests.bench.report.run import Run
-from tests.bench.truth import object_shading
+from tests.bench.truth import object_shading, whole_room
 from tests.bench.truth.composite_truth import CompositeTruth, linear_from_codes, score
 from tests.bench.truth.mitsuba_room import RoomSet
 from tests.bench.truth.room_composites import RoomTruth, SetTruth, set_truth
@@ -394,6 +394,7 @@ def test_a_set_of_the_room_in_short(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(rendering_room, "REFERENCE", "gr15fast")
     monkeypatch.setattr(rendering_room, "SHORT", {})
     monkeypatch.setattr(object_shading, "DIRECTIONS", 128)
+    monkeypatch.setattr(whole_room, "EYES_M", whole_room.EYES_M[:1])
     rows = values(rendering_room.room_part(Run(device, True, SILENT), "key", "tex"))
     direct, gi = "key_tex_direct: GR15FAST, true light", "key_tex_gi: GR15FAST, true light"
     assert rows[f"{direct}: FLIP of what the objects change"][1] == "<= 0.1"
@@ -404,6 +405,9 @@ def test_a_set_of_the_room_in_short(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     floor = "truth with the objects shaded by exact geometry, 16 coefficients"
     assert rows[f"key_tex_direct: {floor}, no indirect light: FLIP of what the objects change"][0] < 0.03
     assert 0.1 < rows["key_tex_direct: pasted without shadows: FLIP of what the objects change"][0] < 0.6
+    brightness = "objects' mean luminance over the true"
+    assert rows[f"{direct}: {brightness}"][0] == pytest.approx(1, abs=0.1)
+    assert rows[f"key_tex_direct: {rendering_room.PART_SEEN}, true light: {brightness}"][0] > 1.3  # walls are missing
     assert {"key_tex_gi.jpg", "key_tex_direct.jpg"} <= {path.name for path in tmp_path.iterdir()}
 
 

@@ -1,4 +1,7 @@
-"""`mitsuba_room`'s composites: every preset under the true light, which measures rendering alone, RM under its own.
+"""`mitsuba_room`'s composites: every preset under the true light in the room scanned whole, RM under its own.
+
+The first measures rendering alone: all that hides the light is known. RM stands there also with the pictures' part of
+the room alone.
 
 A part is the two sets of one light and one kind of surface, with direct light and with global illumination: what the
 second has more than the first is indirect light.
@@ -24,13 +27,16 @@ from tests.bench.rendering.rows import ERROR_GOALS, SHADOW_GOALS, add_pasted, ad
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run, data_folder
 from tests.bench.truth.composite_truth import linear_from_codes, score
+from tests.bench.truth.exact_room import ExactMeshes, Views
 from tests.bench.truth.mitsuba_room import OBJECTS, RoomSet, model_for
 from tests.bench.truth.object_shading import ObjectShading
 from tests.bench.truth.room_composites import RoomTruth, SetTruth, set_truth
+from tests.bench.truth.whole_room import after_whole_room, volume_of
 
 LIGHTS, SURFACES = ("key", "studio"), ("white", "tex")
 """Of the sets that have composites."""
 ESTIMATED, NO_BOUNCE, AVERAGES = "RM, its own light", "RM, no indirect light", "RM, as bright as averages"
+PART_SEEN = "RM, only what the pictures show of the room"
 SHORT = {"RM, rays of 0.1 m": "rm", "ART4, rays of 0.1 m": "art4"}
 """As the thesis runs them in fig. 7.11: what is farther away does not shade."""
 ESTIMATED_GOALS = {"white_direct": 0.08, "white_gi": 0.10, "tex_gi": 0.12}
@@ -40,7 +46,7 @@ FRAMES, QUICK_FRAMES = 6, 2
 
 Floats = NDArray[np.float64]
 Composites = dict[str, list[Codes]]
-"""By preset, `NO_BOUNCE`, `AVERAGES` and `SHORT` under the true light; by `ESTIMATED`."""
+"""By preset, `NO_BOUNCE`, `AVERAGES`, `PART_SEEN` and `SHORT` under the true light; by `ESTIMATED`."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,9 @@ class Room:
     run: Run
     truth: RoomTruth
     shading: ObjectShading
+    meshes: ExactMeshes
+    """Without the virtual objects."""
+    views: Views
 
 
 def room_part(run: Run, light: str, surface: str) -> Part:
@@ -73,7 +82,13 @@ def _room(run: Run) -> Room:
     source = open_source(str(RoomSet(folder, LIGHTS[0], SURFACES[0], "direct").folder))
     frames = (source[i] for i in range(run.of(QUICK_FRAMES, FRAMES)))
     poses = [frame.world_from_camera for frame in frames if frame.world_from_camera is not None]
-    return Room(run, RoomTruth(folder, source.camera, poses), ObjectShading(folder, source.camera, poses))
+    return Room(
+        run,
+        RoomTruth(folder, source.camera, poses),
+        ObjectShading(folder, source.camera, poses),
+        ExactMeshes([folder / "truth" / "room.ply"]),
+        Views(source.camera, poses, np.load(folder / "truth" / "geometry.npz")["depth_m"]),
+    )
 
 
 def _composites(part: Part, room: Room, truth: SetTruth) -> Composites:
@@ -84,13 +99,14 @@ def _composites(part: Part, room: Room, truth: SetTruth) -> Composites:
     usual = wishes_for(source, range(len(source)))
     wishes = msgspec.structs.replace(model_for(item, usual), edges="hard")  # as the truth, a point sample of each pixel
     given = msgspec.structs.replace(wishes, light=tuple((float(r), float(g), float(b)) for r, g, b in truth.light))
-    asked = {preset: at_preset(given, preset) for preset in PRESETS}
-    asked[ESTIMATED] = at_preset(wishes, REFERENCE)
+    whole = msgspec.structs.replace(given, volume_m=volume_of(room.meshes))
+    asked = {preset: at_preset(whole, preset) for preset in PRESETS}
+    asked[ESTIMATED], asked[PART_SEEN] = at_preset(wishes, REFERENCE), at_preset(given, REFERENCE)
     asked[AVERAGES] = msgspec.structs.replace(asked[REFERENCE], tone_mapping="average")
     if item.transport == "gi":
         asked[NO_BOUNCE] = msgspec.structs.replace(asked[REFERENCE], indirect="none")
     else:
-        short = msgspec.structs.replace(given, ray_length_m=THESIS_REACH_M)
+        short = msgspec.structs.replace(whole, ray_length_m=THESIS_REACH_M)
         asked |= {name: at_preset(short, preset) for name, preset in SHORT.items()}
     found: Composites = {}
     for name, of_name in asked.items():
@@ -99,8 +115,11 @@ def _composites(part: Part, room: Room, truth: SetTruth) -> Composites:
         if refused:
             part.leave_out(f"{item.name}: {name}", refused)
         else:
-            frames = (source[i] for i in truth.frames)
-            found[name] = [result.color for result in results_of(room.run.device, source, frames, of_name, objects)]
+            frames = [source[i] for i in truth.frames]
+            sees_part = name in (ESTIMATED, PART_SEEN)
+            fed = frames if sees_part else after_whole_room(source, frames, room.meshes, room.views)
+            results = results_of(room.run.device, source, fed, of_name, objects)
+            found[name] = [result.color for result in results[-len(frames) :]]
     return found
 
 
@@ -109,11 +128,12 @@ def _add_scores(part: Part, room: Room, truth: SetTruth, found: Composites) -> N
     item = truth.item
     of_pasted = add_pasted(part, item.name, truth)
     _add_floor(part, room, truth)
-    for name in (*PRESETS, *SHORT, AVERAGES, ESTIMATED):
+    for name in (*PRESETS, *SHORT, AVERAGES, PART_SEEN, ESTIMATED):
         if name in found:
             row = f"{item.name}: {name.upper() if name in PRESETS else name}" + (", true light" * (name != ESTIMATED))
             goals = _error_goal(item, name), SHADOW_GOALS.get(name)
-            add_score(part, row, truth, found[name], of_pasted, *goals, is_held=name not in (*SHORT, AVERAGES))
+            is_held = name not in (*SHORT, AVERAGES, PART_SEEN)
+            add_score(part, row, truth, found[name], of_pasted, *goals, is_held=is_held)
 
 
 def _error_goal(item: RoomSet, name: str) -> float | None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.maths.sh import lambert_transfer, sh_basis, spherical_fibonacci
 from tests.bench.light.environment import bands_of, relative_rmse
+from tests.bench.truth.exact_room import UNSEEN, ExactMeshes, Views
 from tests.bench.truth.mitsuba_room import OBJECTS, RoomSet
 
 Floats = NDArray[np.float64]
@@ -26,8 +26,6 @@ Bools = NDArray[np.bool_]
 DIRECTIONS = 1024
 """Over the sphere, the same at every pixel; what is open is exact, only what is hidden is sampled."""
 LIFT_M = 1e-4
-SAME_DEPTH_M = 0.01
-"""A hit is seen by a camera whose exact depth there is nearer to it than this."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +41,11 @@ class FrameObjects:
     distances_m: Floats
     """[n, directions] to what a ray meets, infinite where it leaves the room; 0 below the horizon."""
     sources: NDArray[np.int32]
-    """[n, directions] picture element (frame * h * w + pixel) that shows what a ray meets; _UNSEEN where none does,
+    """[n, directions] picture element (frame * h * w + pixel) that shows what a ray meets; UNSEEN where none does,
     _OBJECT where it is an object."""
 
 
-_UNSEEN, _OBJECT, _OPEN = -1, -2, -3
+_OBJECT, _OPEN = -2, -3
 
 
 class ObjectShading:
@@ -58,7 +56,8 @@ class ObjectShading:
         self._truth = dict(np.load(room / "truth" / "geometry.npz").items())
         self._camera, self._poses = camera, poses
         self._directions = spherical_fibonacci(DIRECTIONS)
-        self._room = _Meshes(room)
+        self._room = ExactMeshes([room / "truth" / "room.ply", *(room / "objects" / name for name in OBJECTS)])
+        self._views = Views(camera, poses, self._truth["depth_m"])
         self.frames = [self._trace(index) for index in range(len(poses))]
 
     def radiance(
@@ -100,7 +99,7 @@ class ObjectShading:
             sent = np.where(seen, shown[np.maximum(frame.sources, 0), channel], 0.0)
             of_rooms = float((weights * sent).sum() / max(float((weights * seen).sum()), 1e-12))
             of_objects = float((frame.albedo[:, channel] * np.maximum(shading[:, channel], 0)).mean())
-            sent = np.where(frame.sources == _UNSEEN, of_rooms, sent)
+            sent = np.where(frame.sources == UNSEEN, of_rooms, sent)
             sent = np.where(frame.sources == _OBJECT, of_objects, sent)
             total[:, channel] = (weights * sent).sum(axis=1)
         return total
@@ -122,7 +121,7 @@ class ObjectShading:
         found[hit] = np.where(
             kind[hit] > 0,
             _OBJECT,
-            self._seen_at(origins[hit] + met[hit, None] * self._directions[direction[hit]], index),
+            self._views.sources(origins[hit] + met[hit, None] * self._directions[direction[hit]], index),
         )
         sources[pixel, direction] = found
         return FrameObjects(mask, albedo, normals, distances, sources)
@@ -154,42 +153,3 @@ class ObjectShading:
             normals[here] = (1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
         unit: Floats = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         return unit
-
-    def _seen_at(self, points: Floats, first: int) -> NDArray[np.int32]:
-        """Picture element that shows each room point [n, 3]: of its own frame if it can, else of any other."""
-        height, width = self._truth["depth_m"].shape[1:]
-        found = np.full(len(points), _UNSEEN, np.int32)
-        for index in [first, *(i for i in range(len(self._poses)) if i != first)]:
-            pose, camera = self._poses[index], self._camera
-            x, y, z = ((points - pose[:3, 3]) @ pose[:3, :3]).T
-            ahead = z > 0.05
-            u = np.rint(np.where(ahead, x / np.where(ahead, z, 1) * camera.fx + camera.cx, -1)).astype(int)
-            v = np.rint(np.where(ahead, y / np.where(ahead, z, 1) * camera.fy + camera.cy, -1)).astype(int)
-            inside = ahead & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-            depth = self._truth["depth_m"][index][np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)]
-            new = inside & (np.abs(depth - z) < SAME_DEPTH_M) & (found == _UNSEEN)
-            found[new] = index * height * width + v[new] * width + u[new]
-        return found
-
-
-class _Meshes:
-    """The exact meshes for rays: the room, then the objects."""
-
-    def __init__(self, room: Path) -> None:
-        import open3d
-
-        self._open3d: Any = open3d
-        self._scene = self._open3d.t.geometry.RaycastingScene(nthreads=2)
-        self.meshes: list[tuple[NDArray[np.int64], Floats]] = []
-        """Triangles and vertex normals of each."""
-        for path in (room / "truth" / "room.ply", *(room / "objects" / name for name in OBJECTS)):
-            mesh = self._open3d.io.read_triangle_mesh(str(path))
-            mesh.compute_vertex_normals()
-            self._scene.add_triangles(self._open3d.t.geometry.TriangleMesh.from_legacy(mesh))
-            triangles, normals = np.asarray(mesh.triangles), np.asarray(mesh.vertex_normals)
-            self.meshes.append((triangles.astype(np.int64), normals.astype(np.float64)))
-
-    def cast(self, origins: Floats, directions: Floats) -> dict[str, NDArray[Any]]:
-        """What rays [n, 3] first meet, by Open3D's names."""
-        rays = self._open3d.core.Tensor(np.hstack([origins, directions]).astype(np.float32))
-        return {name: values.numpy() for name, values in self._scene.cast_rays(rays).items()}

@@ -47,10 +47,39 @@ kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETE
 #define SET_STEP 8
 #define BLOCK_SIDE (LANES == 8 ? 16 : 1)
 
+#define BLOCK_CELLS 0x330033ul  // the cells of the first block of 4x4x4 voxels in a brick
+
+// Whether surface is still there that a view showed at `at` (voxel units) when it was drawn: a block of 4x4x4 voxels with a solid one,
+// half a voxel or two and a half behind it. Noise moves surface within a block; what has been taken away leaves none.
+static bool is_still_there(const Volume volume, const float3 at, const float3 ahead) {
+    for (float behind = 0.5f; behind < 3.0f; behind += 2.0f) {
+        const int3 v = clamp(convert_int3(at + behind * ahead), (int3)(0), volume.bricks.xyz * BRICK - 1);
+        const int3 brick = v / BRICK, cell = (v & (BRICK / 2)) / 2;
+        const ulong cells = volume.solid[(brick.z * volume.bricks.y + brick.y) * volume.bricks.x + brick.x];
+        if ((cells >> ((cell.z * 4 + cell.y) * 4 + cell.x)) & BLOCK_CELLS) return true;
+    }
+    return false;
+}
+
+// Those of the lanes in `hidden` whose surface at h (from the views' centre) has gone since their view was drawn.
+static int no_longer_hidden(const Volume volume, const int hidden, const Vectors h, const float4 center, const float4 ahead) {
+    float x[LANES], y[LANES], z[LANES];
+    STORE_LANES(h.x, x);
+    STORE_LANES(h.y, y);
+    STORE_LANES(h.z, z);
+    int gone = 0;
+    for (int lane = 0; lane < LANES; lane++) {
+        if (!((hidden >> lane) & 1)) continue;
+        const float3 at = ((float3)(x[lane], y[lane], z[lane]) + center.xyz) / volume.voxel_m;
+        if (!is_still_there(volume, at, ahead.xyz)) gone |= 1 << lane;
+    }
+    return gone;
+}
+
 // The bits of LANES samples at o (from the views' centre) with normals n: bit j of `bits` [LANES][MASK_WORDS], 0 before, is set where
 // direction j of the set that begins at `set` lies above the surface and its light arrives. shift: of a sample within its pixel.
-static void look(const LookUpParameters p, const Vectors o, const Vectors n, const int set, const float shift_x, const float shift_y,
-                 global const float4 *directions, global const int *view_of, global const float4 *axes, global const float *depths,
+static void look(const LookUpParameters p, const Volume volume, const Vectors o, const Vectors n, const int set, const float shift_x,
+                 const float shift_y, global const float4 *directions, global const int *view_of, global const float4 *axes, global const float *depths,
                  uint *bits) {
     const float distance_m = p.distance_m, per_pixel = p.per_pixel;
     for (int j = 0; j < p.count; j++) {
@@ -71,22 +100,24 @@ static void look(const LookUpParameters p, const Vectors o, const Vectors n, con
         const floatn tz = depth * (sx * right.z + sy * down.z + ahead.z) - (distance_m * ahead.z + o.z);
         const intn hidden = MASK(depth > 0.0f) & MASK(depth < z) & MASK(tx * n.x + ty * n.y + tz * n.z > p.lift_m) &
                             MASK(tx * tx + ty * ty + tz * tz < p.ray_length_m * p.ray_length_m);
-        const int arrives = bits_of(above & ~hidden);
+        const Vectors met = {tx + o.x, ty + o.y, tz + o.z};
+        const int arrives = bits_of(above & ~hidden) | no_longer_hidden(volume, bits_of(above & hidden), met, p.center, ahead);
         for (int lane = 0; lane < LANES; lane++)
             bits[lane * MASK_WORDS + (j >> 5)] |= (uint)((arrives >> lane) & 1) << (j & 31);
     }
 }
 
 // Whether the auxiliary view along each direction sees the sample: no surface in the sample's pixel of the view is nearer to the
-// view, within ray_length_m of the sample and above its tangent plane by lift_m.
+// view, within ray_length_m of the sample, above its tangent plane by lift_m and still there.
 //
 // One item a block of BLOCK_SIDE x BLOCK_SIDE samples of one set; there are block_cols x block_rows blocks of each set. positions
 // [h][w], sample_normals [rows][cols]: nothing is looked up and `lit` is not written where w = 0; axes, depths: see draw_views;
 // view_of [sets][count]: the view for a direction.
 // -> lit [rows][cols][MASK_WORDS]: bit j = direction j lies above the surface and its light arrives.
-kernel void look_into_views(const LookUpParameters p, global const float4 *positions, global const float4 *sample_normals,
-                            global const float4 *directions, global const int *view_of, global const float4 *axes,
+kernel void look_into_views(const LookUpParameters p, VOLUME_PARAMETERS, global const float4 *positions,
+                            global const float4 *sample_normals, global const float4 *directions, global const int *view_of, global const float4 *axes,
                             global const float *depths, global uint *lit) {
+    const Volume volume = VOLUME_OF_PARAMETERS;
     const int item = get_global_id(0);
     const int cols = p.grid.cols, rows = p.grid.rows, blocks = p.block_cols * p.block_rows;
     if (item >= SET_STEP * SET_STEP * blocks) return;
@@ -112,7 +143,7 @@ kernel void look_into_views(const LookUpParameters p, global const float4 *posit
         const Vectors o = {LOAD_LANES(px), LOAD_LANES(py), LOAD_LANES(pz)}, n = {LOAD_LANES(nx), LOAD_LANES(ny), LOAD_LANES(nz)};
         uint bits[LANES * MASK_WORDS];
         for (int k = 0; k < LANES * MASK_WORDS; k++) bits[k] = 0;
-        look(p, o, n, set, shift_x, shift_y, directions, view_of, axes, depths, bits);
+        look(p, volume, o, n, set, shift_x, shift_y, directions, view_of, axes, depths, bits);
         for (int lane = 0; lane < waiting; lane++)
             for (int k = 0; k < MASK_WORDS; k++) lit[sample[lane] * MASK_WORDS + k] = bits[lane * MASK_WORDS + k];
         waiting = 0;

@@ -2,7 +2,9 @@
 
 Kernels: auxiliary_views.cl. The thesis uses four views (left, right, above, along the dominant light) and marches
 through them. Here there are many more, so that each direction has a view nearly along it and needs only one look-up.
-The views are small and the volume changes little between frames, so only some are redrawn in each frame.
+The views are small and the volume changes little between frames, so only some are redrawn in each frame. What has been
+taken out of the volume since a view was drawn hides nothing any more: where a view shows surface, the volume is asked
+whether it is still there. What has been put in hides light once the views are redrawn.
 """
 
 from __future__ import annotations
@@ -188,6 +190,7 @@ def draw_views(engine: Engine, volume: Volume, views: AuxiliaryViews, due: NDArr
 def look_into_views(
     engine: Engine,
     camera: CameraModel,
+    volume: Volume,
     surface: Surface,
     normals: cl_array.Array,
     stride: int,
@@ -223,6 +226,7 @@ def look_into_views(
             ray_length_m=ray_length_m,
             lift_m=lift_m,
         ),
+        *volume.arguments(),
         surface.positions,
         normals,
         rays.on_device(engine),

@@ -251,7 +251,9 @@ def transfer_from_views(
         ),
         surface.positions,
         normals,
-        look_into_views(engine, camera, surface, normals, stride, views, view_of, rays, ray_length_m, lift_m, turn),
+        look_into_views(
+            engine, camera, volume, surface, normals, stride, views, view_of, rays, ray_length_m, lift_m, turn
+        ),
         depths,
         rays.on_device(engine),
         rays.basis_on_device(engine),

@@ -55,6 +55,8 @@ class Looked:
     """[h, w, 4], as are the normals; as the device has them."""
     normals: Floats
     labels: NDArray[np.uint8]
+    solid: NDArray[np.bool_]
+    """[z, y, x] voxels."""
 
 
 def look(engine: Engine, scene: Scene, holes: float = 0.0, hand: Solid | None = None) -> Looked:
@@ -77,7 +79,8 @@ def look(engine: Engine, scene: Scene, holes: float = 0.0, hand: Solid | None = 
     surface.labels.set(labels.astype(np.uint8))
     known = tuple(solid for solid in scene if solid is not hand)
     host = [vectors(engine.download(a)).astype(np.float64) for a in (surface.positions, surface.normals)]
-    return Looked(fill_volume(engine, known, VOXEL_M), surface, *host, labels)
+    volume = fill_volume(engine, known, VOXEL_M)
+    return Looked(volume, surface, *host, labels, solid_voxels(known, volume))
 
 
 def visible_bits(engine: Engine, transfer: Transfer, count: int) -> NDArray[np.bool_]:
@@ -148,6 +151,29 @@ def test_transfer_is_the_twins(
     assert (openness == -1).any()
     assert ((openness > 0.05) & (openness < 0.9)).any()
     assert stride == 8 or ((visible > 0.01) & (visible < 0.99)).any()  # eq. 6.3 took part
+
+
+def test_what_was_taken_out_hides_nothing(device: Device, engine: Engine) -> None:
+    """Views drawn while a ball hung over the floor: without it the floor is as open as by views that are drawn anew."""
+    rays, stride = direction_sets(81, 4), 4
+    threshold = occlusion_threshold(rays.directions[0, :, :3].astype(float))
+    around = SCENES["ball above a floor"]
+    stale = ViewsAround(engine, 48).update(fill_volume(engine, around, VOXEL_M))
+    stale = replace(stale, depths=stale.depths.copy())
+    looked = look(engine, around[:1])
+    fresh = ViewsAround(engine, 48).update(looked.volume)
+    _, view_of = nearest_views(rays, stale.toward)
+    openness = {}
+    for name, views in (("stale", stale), ("fresh", fresh)):
+        result = image_space.transfer_from_views(
+            *(engine, CAMERA, VIEW, looked.volume, looked.surface, views, view_of, stride, rays, ROOM_M, threshold)
+        )
+        openness[name] = engine.download(result.openness).copy()
+    _, sky, _ = twin_of(engine, looked, stale, view_of, stride, rays, ROOM_M, threshold)
+    assert (np.abs(openness["stale"] - sky) < 20 * relative_tolerance(device)).mean() > 0.99
+    here = sky >= 0
+    assert np.abs(openness["stale"] - openness["fresh"])[here].mean() < 0.01
+    assert np.abs(openness["stale"] - openness["fresh"])[here].max() < 0.1
 
 
 @pytest.mark.parametrize("share", [0.0, 0.85, 1.0])
@@ -226,7 +252,7 @@ def twin_of(
         VOXEL_M,
         rays.directions.astype(np.float64),
         rays.basis.astype(np.float64),
-        host_views(engine, views),
+        replace(host_views(engine, views), solid=looked.solid, voxel_m=VOXEL_M),
         view_of,
         near,
         ray_length_m,

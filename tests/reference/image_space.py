@@ -25,6 +25,9 @@ class Views:
     center: Floats
     distance_m: float
     per_pixel: float
+    solid: Bools | None = None
+    """[z, y, x] the solid voxels of `voxel_m` as they are now; None: as when the views were drawn."""
+    voxel_m: float = 0.0
 
     def lines(self, view: int) -> Floats:
         """[side, side, 3] lines of sight with 1 along the axis, volume space."""
@@ -56,8 +59,21 @@ class Views:
         depth = self.depths[view, row, col]
         if depth == 0 or depth >= z:
             return True
-        to = self.eye(view) + depth * self.line(view, row, col) - point
-        return bool(to @ normal <= lift_m or to @ to >= ray_length_m**2)
+        met = self.eye(view) + depth * self.line(view, row, col)
+        to = met - point
+        is_beside = to @ normal <= lift_m or to @ to >= ray_length_m**2
+        return bool(is_beside or not self.is_still_there(view, met))
+
+    def is_still_there(self, view: int, met: Floats) -> bool:
+        """Whether a block of 4x4x4 voxels half a voxel or two and a half behind `met` has a solid one."""
+        if self.solid is None:
+            return True
+        for behind in (0.5, 2.5):
+            voxel = np.trunc(met / self.voxel_m + behind * self.axes[view, 2]).astype(int)[::-1]
+            first = np.clip(voxel, 0, np.array(self.solid.shape) - 1) // 4 * 4
+            if self.solid[tuple(slice(i, i + 4) for i in first)].any():
+                return True
+        return False
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ import trimesh
 from server.opencl.device import Device
 from server.service.serve import BackgroundServer
 from server.service.service import Service
+from tests.bench.report.run import Run
+from tests.bench.service import replay as service_replay
 from tests.bench.service.bytes import Fed, _Kept, feed
 from tests.bench.service.faults import Tally, part_of
 from tests.bench.service.floods import Held
@@ -55,6 +57,17 @@ def test_what_a_room_has_fused_is_read_over_the_socket(device: Device) -> None:
     with BackgroundServer(Service(device)) as server:
         shown_s, fused_s = asyncio.run(stream(server.url))
     assert fused_s == pytest.approx(shown_s, abs=0.6)
+
+
+def test_a_session_is_replayed_down_to_the_last_bit_of_its_lights(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: Device
+) -> None:
+    monkeypatch.setattr(service_replay, "RUNS", 2)
+    part = service_replay.replay_part(Run(device, True, lambda _text: None), tmp_path)
+    assert {row.name: row.value for row in part.rows} == {
+        "replays whose composites and lights have the recording's SHA-256, of 2": 2,
+        "frames of the recording": service_replay.QUICK_FRAMES,
+    }
 
 
 def test_a_full_disk_and_a_kill_take_nothing_that_was_acknowledged_without_an_error(tmp_path: Path) -> None:

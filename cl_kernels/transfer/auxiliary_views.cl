@@ -49,7 +49,7 @@ kernel void draw_views(const int count, global const int *views, VOLUME_PARAMETE
 
 #define BLOCK_CELLS 0x330033ul  // the cells of the first block of 4x4x4 voxels in a brick
 
-// Whether surface is still there that a view showed at `at` (voxel units) when it was drawn: a block of 4x4x4 voxels with a solid one,
+// Whether surface is still there that a view met at `at` (voxel units) when it was drawn: a block of 4x4x4 voxels with a solid one,
 // half a voxel or two and a half behind it. Noise moves surface within a block; what has been taken away leaves none.
 static bool is_still_there(const Volume volume, const float3 at, const float3 ahead) {
     for (float behind = 0.5f; behind < 3.0f; behind += 2.0f) {
@@ -79,8 +79,8 @@ static int no_longer_hidden(const Volume volume, const int hidden, const Vectors
 // The bits of LANES samples at o (from the views' centre) with normals n: bit j of `bits` [LANES][MASK_WORDS], 0 before, is set where
 // direction j of the set that begins at `set` lies above the surface and its light arrives. shift: of a sample within its pixel.
 static void look(const LookUpParameters p, const Volume volume, const Vectors o, const Vectors n, const int set, const float shift_x,
-                 const float shift_y, global const float4 *directions, global const int *view_of, global const float4 *axes, global const float *depths,
-                 uint *bits) {
+                 const float shift_y, global const float4 *directions, global const int *view_of, global const float4 *axes,
+                 global const float *depths, uint *bits) {
     const float distance_m = p.distance_m, per_pixel = p.per_pixel;
     for (int j = 0; j < p.count; j++) {
         const float4 w = directions[set + j];
@@ -115,8 +115,8 @@ static void look(const LookUpParameters p, const Volume volume, const Vectors o,
 // view_of [sets][count]: the view for a direction.
 // -> lit [rows][cols][MASK_WORDS]: bit j = direction j lies above the surface and its light arrives.
 kernel void look_into_views(const LookUpParameters p, VOLUME_PARAMETERS, global const float4 *positions,
-                            global const float4 *sample_normals, global const float4 *directions, global const int *view_of, global const float4 *axes,
-                            global const float *depths, global uint *lit) {
+                            global const float4 *sample_normals, global const float4 *directions, global const int *view_of,
+                            global const float4 *axes, global const float *depths, global uint *lit) {
     const Volume volume = VOLUME_OF_PARAMETERS;
     const int item = get_global_id(0);
     const int cols = p.grid.cols, rows = p.grid.rows, blocks = p.block_cols * p.block_rows;

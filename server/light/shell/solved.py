@@ -17,8 +17,8 @@ class Solved:
     covariance: NDArray[np.float32]
     """[n, n] of the logarithms of the first n sources' radiance."""
     condition: float
-    """Of the objective's curvature, in the 1-norm, of what the first n sources need of its inverse; infinite before
-    anything is solved."""
+    """Of the objective's curvature, in the 1-norm, with the first n columns of its inverse; infinite before anything is
+    solved."""
     mean: float
     """Logarithm of the mean radiance about which sources lie."""
     step: float

@@ -157,10 +157,10 @@ def test_what_was_taken_out_hides_nothing(device: Device, engine: Engine) -> Non
     """Views drawn while a ball hung over the floor: without it the floor is as open as by views that are drawn anew."""
     rays, stride = direction_sets(81, 4), 4
     threshold = occlusion_threshold(rays.directions[0, :, :3].astype(float))
-    around = SCENES["ball above a floor"]
-    stale = ViewsAround(engine, 48).update(fill_volume(engine, around, VOXEL_M))
+    scene = SCENES["ball above a floor"]
+    stale = ViewsAround(engine, 48).update(fill_volume(engine, scene, VOXEL_M))
     stale = replace(stale, depths=stale.depths.copy())
-    looked = look(engine, around[:1])
+    looked = look(engine, scene[:1])
     fresh = ViewsAround(engine, 48).update(looked.volume)
     _, view_of = nearest_views(rays, stale.toward)
     openness = {}

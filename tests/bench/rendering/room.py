@@ -27,7 +27,7 @@ from tests.bench.rendering.rows import ERROR_GOALS, SHADOW_GOALS, add_pasted, ad
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run, data_folder
 from tests.bench.truth.composite_truth import linear_from_codes, score
-from tests.bench.truth.exact_room import ExactMeshes, Views
+from tests.bench.truth.exact_room import ExactMeshes
 from tests.bench.truth.mitsuba_room import OBJECTS, RoomSet, model_for
 from tests.bench.truth.object_shading import ObjectShading
 from tests.bench.truth.room_composites import RoomTruth, SetTruth, set_truth
@@ -58,7 +58,6 @@ class Room:
     shading: ObjectShading
     meshes: ExactMeshes
     """Without the virtual objects."""
-    views: Views
 
 
 def room_part(run: Run, light: str, surface: str) -> Part:
@@ -87,7 +86,6 @@ def _room(run: Run) -> Room:
         RoomTruth(folder, source.camera, poses),
         ObjectShading(folder, source.camera, poses),
         ExactMeshes([folder / "truth" / "room.ply"]),
-        Views(source.camera, poses, np.load(folder / "truth" / "geometry.npz")["depth_m"]),
     )
 
 
@@ -117,7 +115,7 @@ def _composites(part: Part, room: Room, truth: SetTruth) -> Composites:
         else:
             frames = [source[i] for i in truth.frames]
             sees_part = name in (ESTIMATED, PART_SEEN)
-            fed = frames if sees_part else after_whole_room(source, frames, room.meshes, room.views)
+            fed = frames if sees_part else after_whole_room(source, frames, room.meshes, room.shading.views)
             results = results_of(room.run.device, source, fed, of_name, objects)
             found[name] = [result.color for result in results[-len(frames) :]]
     return found

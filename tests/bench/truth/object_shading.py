@@ -57,7 +57,8 @@ class ObjectShading:
         self._camera, self._poses = camera, poses
         self._directions = spherical_fibonacci(DIRECTIONS)
         self._room = ExactMeshes([room / "truth" / "room.ply", *(room / "objects" / name for name in OBJECTS)])
-        self._views = Views(camera, poses, self._truth["depth_m"])
+        self.views = Views(camera, poses, self._truth["depth_m"])
+        """What the frames show of the room."""
         self.frames = [self._trace(index) for index in range(len(poses))]
 
     def radiance(
@@ -121,7 +122,7 @@ class ObjectShading:
         found[hit] = np.where(
             kind[hit] > 0,
             _OBJECT,
-            self._views.sources(origins[hit] + met[hit, None] * self._directions[direction[hit]], index),
+            self.views.sources(origins[hit] + met[hit, None] * self._directions[direction[hit]], index),
         )
         sources[pixel, direction] = found
         return FrameObjects(mask, albedo, normals, distances, sources)

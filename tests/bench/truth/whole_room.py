@@ -17,7 +17,7 @@ from client.sources.frame_source import Source
 from protocol.frames import CameraModel, RgbdFrame
 from server.maths.sh import spherical_fibonacci
 from tests.bench.truth.exact_room import UNSEEN, ExactMeshes, Views
-from tests.scenes.analytic import look_at
+from tests.scenes.analytic import look_at, pixel_rays
 
 Floats = NDArray[np.float64]
 
@@ -59,9 +59,8 @@ def _looking(eye: tuple[float, float, float], direction: Floats) -> Floats:
 
 def _exact_depth(camera: CameraModel, meshes: ExactMeshes, pose: Floats) -> tuple[Floats, Floats]:
     """[h, w] depth in metres, 0 where nothing is met, and [h, w, 3] the points, world."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    directions = (rays @ pose[:3, :3].T).reshape(-1, 3)
+    directions = (pixel_rays(camera) @ pose[:3, :3].T).reshape(-1, 3)
     met = meshes.cast(np.broadcast_to(pose[:3, 3], directions.shape), directions)["t_hit"].astype(np.float64)
     depth_m = np.where(np.isfinite(met), met, 0.0)  # z of a ray is 1
-    return depth_m.reshape(u.shape), (pose[:3, 3] + directions * depth_m[:, None]).reshape(*u.shape, 3)
+    shape = (camera.height, camera.width)
+    return depth_m.reshape(shape), (pose[:3, 3] + directions * depth_m[:, None]).reshape(*shape, 3)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from statistics import median
 
 import cv2
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,19 +18,16 @@ from client.streaming.adaptive import LADDER
 from client.streaming.coding import Coding, frame_message, picture_bytes
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color, decode_depth
-from server.client_session import ClientSession
 from server.maths.light_direction import direction_error_deg
 from server.opencl.device import Device
-from server.scene.mesh import load_mesh
-from server.scene.placement import Placement
-from server.scene.vase import vase_glb
-from tests.bench.light.runs import wishes_for
+from server.pipeline import FrameResult
+from tests.bench.light.environment import irradiance_error
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run, data_source
-from tests.bench.service.speed import looked_at
+from tests.bench.speed.suite import kitchen_stage
 
 FPS = 15
-QUICK_FRAMES, FRAMES = {"bandwidth": 10, "cost": 6}, {"bandwidth": 40, "cost": 20}
+QUICK_FRAMES, FRAMES = {"bandwidth": 10, "cost": 26}, {"bandwidth": 40, "cost": 60}
 KINECT_NOISE_PER_M = 0.00285
 """One step of its disparity, an eighth of a pixel at 585 px and 7.5 cm: what one and the same point flickers by."""
 OAK_BASELINE_M = 0.075
@@ -55,8 +53,12 @@ def oak_noise_per_m(camera: CameraModel) -> float:
     return OAK_DISPARITY_NOISE_PX / (camera.fx * OAK_BASELINE_M)
 
 
+SETTLED = 20
+"""Frames after which light is compared: after fewer, little of the room was seen, and whatever changes in them turns
+the light at the object by tens of degrees."""
+
 Seen = tuple[NDArray[np.uint8], NDArray[np.float64]]
-"""Picture and SH of one frame."""
+"""Picture of one frame, and the light at the virtual object."""
 
 
 def mbit_per_s(frames: list[RgbdFrame], camera: CameraModel, coding: Coding) -> float:
@@ -105,7 +107,7 @@ def cost_part(run: Run, _out: Path) -> Part:
     source, count = kitchen(), run.of(QUICK_FRAMES["cost"], FRAMES["cost"])
     part = Part(sizes={"frames of cost": count})
     frames = list(islice((source[i] for i in range(len(source))), count))
-    truth = run_pipeline(run.device, source, frames)
+    truth = run_pipeline(run.device, frames)
     virtual = [(np.abs(p.astype(int) - f.color) > 2).any(-1) for (p, _), f in zip(truth, frames, strict=True)]
     codings = {
         "exact depth, reduced colour": EXACT,
@@ -115,21 +117,13 @@ def cost_part(run: Run, _out: Path) -> Part:
     }
     for name, coding in codings.items():
         run.say(f"cost of {name}, {count} frames")
-        found = run_pipeline(run.device, source, [_over_the_wire(frame, source.camera, coding) for frame in frames])
-        turns = turns_deg(found, truth)
+        found = run_pipeline(run.device, (_over_the_wire(frame, source.camera, coding) for frame in frames))
+        add_light(part, f"cost of {name}", found, truth)
         errors = [np.abs(p.astype(int) - true) for (p, _), (true, _) in zip(found, truth, strict=True)]
         on_virtual = np.concatenate([error[mask].ravel() for error, mask in zip(errors, virtual, strict=True)])
-        part.add(f"cost of {name}: direction of the light, last frame", turns[-1], "degrees")
-        part.add(f"cost of {name}: direction, mean", float(np.mean(turns)), "degrees")
         part.add(f"cost of {name}: picture, mean", float(np.mean(errors)), "of 255")
         part.add(f"cost of {name}: virtual pixels, mean", float(on_virtual.mean()), "of 255")
     return part
-
-
-def turns_deg(found: list[Seen], truth: list[Seen]) -> list[float]:
-    """By how much the dominant direction of each frame's light is off."""
-    pairs = zip(found, truth, strict=True)
-    return [direction_error_deg(light, true_light) for (_, light), (_, true_light) in pairs]
 
 
 def _spread(source: Source, count: int) -> list[RgbdFrame]:
@@ -143,14 +137,23 @@ def _over_the_wire(frame: RgbdFrame, camera: CameraModel, coding: Coding) -> Rgb
     return replace(frame, color=decode_color(message.color, camera), depth=decode_depth(message.depth, camera))
 
 
-def run_pipeline(device: Device, source: Source, frames: list[RgbdFrame]) -> list[Seen]:
-    """Picture and light of each frame, with a vase where the first one looks."""
-    wishes = msgspec.structs.replace(wishes_for(source, range(len(source))), preset="reg4")
-    pipeline = ClientSession(device, source.camera, wishes)
-    x, y, z = looked_at(source[0], source.camera.depth_scale_m).tolist()
-    pipeline.place_object("vase", load_mesh(vase_glb(), "glb"), Placement(position_m=(x, y, z), scale=1.0, yaw_deg=0.0))
+def run_pipeline(device: Device, frames: Iterable[RgbdFrame]) -> list[Seen]:
+    """Picture of each frame of the kitchen with the defaults, and the light at the virtual object on its table."""
+    stage = kitchen_stage()
+    session = stage.session(device, range(len(stage.source)))
     try:
-        results = [pipeline.process(frame) for frame in frames]
+        return [_seen(session.process(frame)) for frame in frames]
     finally:
-        pipeline.close()
-    return [(result.color, np.array(result.light.sh)) for result in results]
+        session.close()
+
+
+def _seen(result: FrameResult) -> Seen:
+    at_object = next(light for light in result.light.at if light.of == "object")
+    return result.color, np.array(at_object.sh)
+
+
+def add_light(part: Part, name: str, found: list[Seen], truth: list[Seen]) -> None:
+    """By how much the light is off, median of the frames from SETTLED on."""
+    pairs = [(light, true) for (_, light), (_, true) in zip(found[SETTLED:], truth[SETTLED:], strict=True)]
+    part.add(f"{name}: direction of the light", median(direction_error_deg(*pair) for pair in pairs), "degrees")
+    part.add(f"{name}: irradiance", 100 * median(irradiance_error(*pair) for pair in pairs), "%")

@@ -18,11 +18,11 @@ from client.streaming.coding import Coding, frame_message
 from client.streaming.video import IS_POSSIBLE, VideoEncoder
 from protocol.colors import ColorReader
 from protocol.frames import RgbdFrame
-from tests.bench.client.bandwidth import FPS, kitchen, psnr_db, run_pipeline, turns_deg
+from tests.bench.client.bandwidth import FPS, add_light, kitchen, psnr_db, run_pipeline
 from tests.bench.report.finished import Part, UnmeasurableError
 from tests.bench.report.run import Run
 
-QUICK_FRAMES, FRAMES = {"colour": 12, "light": 8}, {"colour": 24, "light": 20}
+QUICK_FRAMES, FRAMES = {"colour": 12, "light": 26}, {"colour": 24, "light": 60}
 SOURCES: dict[str, Callable[[], Source]] = {
     "kitchen": kitchen,
     "synthetic room": lambda: open_source("synthetic:room?frames=160&noise=1"),
@@ -95,15 +95,13 @@ def _add_light(part: Part, run: Run) -> None:
     source, count = kitchen(), run.of(QUICK_FRAMES["light"], FRAMES["light"])
     part.sizes["frames of light from coded colour"] = count
     frames = list(islice((source[place] for place in range(0, len(source), 2)), count))
-    truth = run_pipeline(run.device, source, frames)
+    truth = run_pipeline(run.device, frames)
     for kind, coding in CODINGS.items():
         for codec, video in {"JPEG": None, "H.264": VideoEncoder()}.items():
             run.say(f"light from {kind}, {codec}")
             colors = coded(frames, source, coding, video).colors
             sent = [replace(frame, color=color) for frame, color in zip(frames, colors, strict=True)]
-            turns = turns_deg(run_pipeline(run.device, source, sent), truth)
-            part.add(f"light from {kind}, {codec}: direction, mean", float(np.mean(turns)), "degrees")
-            part.add(f"light from {kind}, {codec}: direction, last frame", turns[-1], "degrees")
+            add_light(part, f"light from {kind}, {codec}", run_pipeline(run.device, sent), truth)
 
 
 if __name__ == "__main__":

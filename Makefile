@@ -9,7 +9,8 @@ DATA ?= ../shared/data
 help:
 	@echo "make demo      the main job: server, streaming client, pictures in out/demo"
 	@echo "make test      the quick tests: every kind, on the first OpenCL device; TESTS=path runs only those"
-	@echo "make test-all  every test, on two OpenCL devices: test, then test-rest, which is what test leaves out"
+	@echo "make test-all  every test, and those of kernels on a second OpenCL device: test, then test-rest,"
+	@echo "               which is what test leaves out"
 	@echo "make slow-list measures all tests and writes tests/slow.txt, the list of those that test leaves out"
 	@echo "make lint      formatting, types"
 	@echo "make bench     the benchmarks      make web    rebuild the page from its sources"
@@ -65,15 +66,17 @@ test-slow: .venv/installed-all
 	$(PYTEST) $(PARALLEL) -m "slow and not cluster"
 	$(PYTEST) -m "slow and cluster" tests/cluster
 
-# Kernels and the pipeline; what the others need a device for does not depend on which.
-ON_EVERY_DEVICE := $(addprefix tests/,kernels opencl pipeline hard_cases)
+# Kernels whole, and the pipeline in short: it is the same code for all devices. What the others need a device for does not
+# depend on which.
+KERNEL_TESTS := $(addprefix tests/,kernels opencl hard_cases)
 
 # The loader of OpenCL finds PoCL in any case, and Intel's runtime by this folder. The name is the platform's, since PoCL's
 # device holds "Intel" too on a processor of theirs.
 test-second-device: export OCL_ICD_VENDORS := $(CURDIR)/.venv/opencl
 test-second-device: export PROBELESS_TEST_DEVICE := intel(r) opencl
 test-second-device: .venv/installed-all
-	$(PYTEST) $(PARALLEL) -m device $(ON_EVERY_DEVICE)
+	$(PYTEST) $(PARALLEL) -m device $(KERNEL_TESTS)
+	$(PYTEST) $(PARALLEL) -m "device and not slow" tests/pipeline
 
 # Scenes are baked anew, as after a fresh clone; kernels are not compiled anew.
 slow-list: export POCL_CACHE_DIR := $(or $(POCL_CACHE_DIR),$(HOME)/.cache/pocl)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
-from scipy.stats import truncnorm
+from scipy.special import ndtr
 
 from tests.reference.sh import open_transfer
 
@@ -52,21 +52,26 @@ def upsample(samples: Samples, surface: Buffer, x: int, y: int, tolerance_m: flo
     """[4] joint-bilateral mean of the samples around a pixel: a box four samples wide, times closeness
     to the pixel's tangent plane, times agreement of the normals; w = 0 where none fits.
     """
-    rows, cols = samples.values.shape[:2]
-    u, v = ((c - samples.stride // 2) / samples.stride for c in (x, y))
+    (down, v), (right, u) = (
+        _around(at, samples.stride, count) for at, count in zip((y, x), samples.values.shape[:2], strict=True)
+    )
+    around = samples.values[down, right]
+    first, stride = samples.stride // 2, samples.stride
+    pixels = tuple(slice(first + part.start * stride, first + part.stop * stride, stride) for part in (down, right))
     position, normal = surface.positions[y, x, :3], surface.normals[y, x, :3]
-    total = np.zeros(4)
-    for row in range(int(np.floor(v)) - 2, int(np.floor(v)) + 4):
-        for col in range(int(np.floor(u)) - 2, int(np.floor(u)) + 4):
-            if not (0 <= row < rows and 0 <= col < cols) or samples.values[row, col, 3] <= 0:
-                continue
-            py, px = samples.stride // 2 + row * samples.stride, samples.stride // 2 + col * samples.stride
-            off_plane = normal @ (surface.positions[py, px, :3] - position) / tolerance_m
-            facing = max(float(normal @ surface.normals[py, px, :3]), 0.0)
-            box = min(max(2.5 - abs(col - u), 0), 1) * min(max(2.5 - abs(row - v), 0), 1)
-            weight = box * facing**4 / (1 + off_plane**4)
-            total += weight * np.array([*samples.values[row, col, :3], 1])
-    return np.array([*(total[:3] / total[3]), 1]) if total[3] > 1e-4 else np.zeros(4)
+    off_plane = (surface.positions[pixels][..., :3] - position) @ normal / tolerance_m
+    facing = np.maximum(surface.normals[pixels][..., :3] @ normal, 0)
+    box = np.outer(np.clip(2.5 - np.abs(v), 0, 1), np.clip(2.5 - np.abs(u), 0, 1))
+    weights = np.where(around[..., 3] > 0, box * facing**4 / (1 + off_plane**4), 0)
+    total = weights.sum()
+    return np.array([*np.einsum("rc,rck->k", weights, around[..., :3]) / total, 1]) if total > 1e-4 else np.zeros(4)
+
+
+def _around(pixel: int, stride: int, count: int) -> tuple[slice, Floats]:
+    """Of a row of samples those near a pixel, at most 6, and how far behind it each is, in samples."""
+    at = (pixel - stride // 2) / stride
+    near = slice(max(int(np.floor(at)) - 2, 0), min(int(np.floor(at)) + 4, count))
+    return near, np.arange(near.start, near.stop) - at
 
 
 _cubic = BSpline.basis_element(np.arange(-2, 3), extrapolate=False)
@@ -96,7 +101,9 @@ def restored(radiance: Floats, x: int, y: int, log_white: Floats) -> Floats:
     around = radiance[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3].reshape(-1, 4)
     share = (around[around[:, 3] >= 0, :3] >= CLIPPED).mean(axis=0)
     middle = np.maximum(brightness + log_white, -8 * DEVIATION)
-    above = truncnorm.mean(-middle / DEVIATION, np.inf, loc=middle, scale=DEVIATION)
+    bound = -middle / DEVIATION
+    density = np.exp(-(bound**2) / 2) / np.sqrt(2 * np.pi)
+    above = middle + DEVIATION * density / ndtr(-bound)  # mean of a normal distribution's part above 0
     return np.where(clipped, np.maximum(seen, np.exp(share * above)), seen)
 
 

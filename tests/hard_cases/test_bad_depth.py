@@ -6,6 +6,7 @@ What is wrong is said: in the frame's notes, or as a ValueError of one line that
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from itertools import product
 from typing import Any
 
@@ -41,15 +42,22 @@ Open = Callable[..., ClientSession]
 Place = tuple[float, float, float]
 
 
+def session_with_an_object(
+    device: Device, wishes: Wishes = WISHES, offset: Any = (0.0, 0.0, 0.0), camera: CameraModel = CAMERA
+) -> ClientSession:
+    pipeline = ClientSession(device, camera, wishes)
+    x, y, z = (float(value) for value in np.array([-0.2, 0.7, 1.1]) + offset)
+    pipeline.place_object("pyramid", soup_of(PYRAMID), Placement(position_m=(x, y, z)))
+    return pipeline
+
+
 @pytest.fixture
 def open_pipeline(device: Device) -> Iterator[Open]:
     """Makes pipelines with one object that stands in the room, and closes them."""
     made: list[ClientSession] = []
 
-    def start(wishes: Wishes = WISHES, offset: Any = (0.0, 0.0, 0.0), camera: CameraModel = CAMERA) -> ClientSession:
-        made.append(ClientSession(device, camera, wishes))
-        x, y, z = (float(value) for value in np.array([-0.2, 0.7, 1.1]) + offset)
-        made[-1].place_object("pyramid", soup_of(PYRAMID), Placement(position_m=(x, y, z)))
+    def start(*given: Any, **named: Any) -> ClientSession:
+        made.append(session_with_an_object(device, *given, **named))
         return made[-1]
 
     yield start
@@ -87,18 +95,36 @@ def test_bad_depth_from_the_start(open_pipeline: Open, name: str) -> None:
     assert np.abs(after.light.dominant_direction).max() > 0
 
 
-@pytest.mark.parametrize("name", BAD_DEPTH)
-def test_bad_depth_in_between(open_pipeline: Open, name: str) -> None:
-    """A light that was found stays finite; the reconstruction is not lost, and stands in for depth that is missing."""
+def in_between(pipeline: ClientSession, depth: Any) -> FrameResult:
+    """The result of good frames, before and after three with this depth."""
     view = look_at((0.2, -0.2, 0.0), (0.1, 0.3, 1.2))
-    results = []
-    for depth in (BAD_DEPTH[name], good_depth(view)):
-        pipeline = open_pipeline()
+    lit(pipeline)
+    for index in range(3, 6):
+        assert_sound(pipeline.process(frame_of(depth, view, index)))
+    result = lit(pipeline)
+    assert_sound(result)
+    return result
+
+
+@pytest.fixture(scope="module")
+def good_in_between(device: Device) -> FrameResult:
+    """That of good depth, for every kind of bad one."""
+    with closing(session_with_an_object(device)) as pipeline:
+        return in_between(pipeline, good_depth(look_at((0.2, -0.2, 0.0), (0.1, 0.3, 1.2))))
+
+
+@pytest.fixture(scope="module")
+def lit_twice(device: Device) -> FrameResult:
+    """Of a session that had no wrong frame in between."""
+    with closing(session_with_an_object(device)) as pipeline:
         lit(pipeline)
-        for index in range(3, 6):
-            assert_sound(pipeline.process(frame_of(depth, view, index)))
-        results.append(lit(pipeline))
-        assert_sound(results[-1])
+        return lit(pipeline)
+
+
+@pytest.mark.parametrize("name", BAD_DEPTH)
+def test_bad_depth_in_between(open_pipeline: Open, good_in_between: FrameResult, name: str) -> None:
+    """A light that was found stays finite; the reconstruction is not lost, and stands in for depth that is missing."""
+    results = in_between(open_pipeline(), BAD_DEPTH[name]), good_in_between
     if name in ("empty", "saturated", "beyond 10 m", "one pixel"):
         bad, good = (np.array(result.light.dominant_direction) for result in results)
         # Three frames from the side are in the one light and not in the other. Seen: 10.1.
@@ -207,18 +233,16 @@ NO_POSES: dict[str, Matrix | None] = {
 
 
 @pytest.mark.parametrize("name", NO_POSES)
-def test_what_is_no_pose_is_refused(open_pipeline: Open, name: str) -> None:
+def test_what_is_no_pose_is_refused(open_pipeline: Open, lit_twice: FrameResult, name: str) -> None:
     pipeline = open_pipeline()
     before = lit(pipeline)
     good = frame_of(good_depth(np.eye(4)))
     with pytest.raises(ValueError, match=r"world_from_camera|pose") as caught:
         pipeline.process(RgbdFrame(9, 0.3, good.color, good.depth, NO_POSES[name]))
     assert "\n" not in str(caught.value)
-    again = open_pipeline()
-    lit(again)
-    for left, right in zip([lit(pipeline)], [lit(again)], strict=True):  # as if the frame had never come
-        np.testing.assert_array_equal(left.color, right.color)
-        assert left.light == right.light
+    after = lit(pipeline)  # as if the frame had never come
+    np.testing.assert_array_equal(after.color, lit_twice.color)
+    assert after.light == lit_twice.light
     assert before.color.shape == good.color.shape
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,22 +123,10 @@ def make_room(
 
     ambient: radiance from all that is not scanned, or a function of directions [..., 3]. known: of what is.
     """
-    points, normals, colors = [], [], []
-    for axis, color in albedos.items():
-        first, second = (a for a in range(3) if a != axis)
-        u, v = np.meshgrid(*(np.arange(SPACING_M / 2, SIZE_M[a], SPACING_M) for a in (first, second)))
-        at = np.zeros((u.size, 3))
-        at[:, first], at[:, second] = u.ravel(), v.ravel()
-        points.append(at)
-        normals.append(np.tile(np.eye(3)[axis], (u.size, 1)))
-        colors.append(np.tile(color, (u.size, 1)))
-    at, facing, albedo = np.concatenate(points), np.concatenate(normals), np.concatenate(colors)
+    pictures = _exact_pictures(lamp, ambient, tuple(albedos.items()), tuple(np.asarray(known, float).tolist()))
+    at, facing, shown, arrivals = (array.copy() for array in pictures)
     patches = Patches()
     rows: NDArray[np.int64] = np.arange(len(at))
-    directions = np.broadcast_to(ray_directions(), (len(at), RAYS, 3))
-    from_beyond = ambient(directions) if callable(ambient) else np.array(ambient)
-    radiance, arrivals = sent(at, directions, lamp, from_beyond, known)
-    shown = np.log(albedo * np.einsum("nm,nmr->nr", hemisphere_weights(facing), radiance))
     patches.add(Seen(at + 1e-4, facing, shown, np.zeros(len(at)), np.zeros(len(at))))
     # `add` sorts the patches: bring the rays into its order.
     order = np.array([np.abs(at + 1e-4 - position).sum(1).argmin() for position in patches.positions[rows]])
@@ -147,3 +136,27 @@ def make_room(
     transport = Transport()
     transport.update(patches, NO_EMITTERS, rows, shell)
     return ShellRoom(patches, transport, shell, Unknowns())
+
+
+@lru_cache(maxsize=8)
+def _exact_pictures(
+    lamp: Lamp | None,
+    ambient: tuple[float, float, float] | Callable[[Floats], Floats],
+    albedos: tuple[tuple[int, tuple[float, float, float]], ...],
+    known: tuple[float, float, float],
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Of all patches [n]: positions, normals, log radiance [n, 3], and what arrives along their rays [n, m, 4]."""
+    points, normals, colors = [], [], []
+    for axis, color in albedos:
+        first, second = (a for a in range(3) if a != axis)
+        u, v = np.meshgrid(*(np.arange(SPACING_M / 2, SIZE_M[a], SPACING_M) for a in (first, second)))
+        at = np.zeros((u.size, 3))
+        at[:, first], at[:, second] = u.ravel(), v.ravel()
+        points.append(at)
+        normals.append(np.tile(np.eye(3)[axis], (u.size, 1)))
+        colors.append(np.tile(color, (u.size, 1)))
+    at, facing, albedo = np.concatenate(points), np.concatenate(normals), np.concatenate(colors)
+    directions = np.broadcast_to(ray_directions(), (len(at), RAYS, 3))
+    from_beyond = ambient(directions) if callable(ambient) else np.array(ambient)
+    radiance, arrivals = sent(at, directions, lamp, from_beyond, np.array(known))
+    return at, facing, np.log(albedo * np.einsum("nm,nmr->nr", hemisphere_weights(facing), radiance)), arrivals

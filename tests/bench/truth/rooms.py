@@ -97,5 +97,8 @@ def seen_depth(engine: Engine, volume: Volume, camera: CameraModel, world_from_c
 
 
 def _span(origin: Floats, rays: Floats, low: ArrayLike, high: ArrayLike) -> tuple[Floats, Floats]:
-    a, b = (np.asarray(low) - origin) / rays, (np.asarray(high) - origin) / rays
-    return np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+    enter, leave = np.full(rays.shape[:-1], -np.inf), np.full(rays.shape[:-1], np.inf)
+    for axis in range(3):  # by column: along rows of 3 NumPy is slow
+        a, b = ((np.asarray(corner)[axis] - origin[axis]) / rays[..., axis] for corner in (low, high))
+        enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
+    return enter, leave

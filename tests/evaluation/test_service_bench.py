@@ -7,6 +7,7 @@ import random
 import time
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,7 +29,7 @@ from tests.bench.service.guests import CAMERA, FIRST_PX, FULL_S, LAST_PX, WALL_M
 from tests.bench.service.http import bad_request
 from tests.bench.service.load import growth, overhead
 from tests.bench.service.odd_numbers import Outcome, play_sessions
-from tests.bench.service.process import Served, stop
+from tests.bench.service.process import Served, Unusual, serving, stop
 from tests.servers import fake_server
 from tests.service.fakes import PATIENCE_S, FakePipeline, FakeResult, Lab
 
@@ -62,17 +63,19 @@ def test_what_a_room_has_fused_is_read_over_the_socket(device: Device) -> None:
 def test_a_session_is_replayed_down_to_the_last_bit_of_its_lights(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: Device
 ) -> None:
-    monkeypatch.setattr(service_replay, "RUNS", 2)
+    """Each by a server of its own, which compiles only the kernels that the session needs."""
+    monkeypatch.setattr(service_replay, "RUNS", 1)
+    monkeypatch.setattr(service_replay, "serving", partial(serving, unusual=Unusual(warms_up=False)))
     part = service_replay.replay_part(Run(device, True, lambda _text: None), tmp_path)
     assert {row.name: row.value for row in part.rows} == {
-        "replays whose composites and lights have the recording's SHA-256, of 2": 2,
+        "replays whose composites and lights have the recording's SHA-256, of 1": 1,
         "frames of the recording": service_replay.QUICK_FRAMES,
     }
 
 
 def test_a_full_disk_and_a_kill_take_nothing_that_was_acknowledged_without_an_error(tmp_path: Path) -> None:
     found = Found()
-    served = begin(tmp_path / "log", str(tmp_path / "rooms"))
+    served = begin(tmp_path / "log", str(tmp_path / "rooms"), warms_up=False)  # no frame is sent
     try:
         served = disk_full_then_killed(served, "study", random.Random(1), found)
     finally:

@@ -78,9 +78,9 @@ def full_disk_part(run: Run, out: Path) -> Part:
     return part
 
 
-def begin(log: Path, data: str) -> Served:
+def begin(log: Path, data: str, *, warms_up: bool = True) -> Served:
     """A server whose disk can get full."""
-    return start(log, *OPEN_DOOR, "--data", data, unusual=Unusual(fault="disk"))
+    return start(log, *OPEN_DOOR, "--data", data, unusual=Unusual(fault="disk", warms_up=warms_up))
 
 
 def disk_full_then_killed(served: Served, room: str, chance: random.Random, found: Found) -> Served:

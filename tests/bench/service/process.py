@@ -1,7 +1,7 @@
 """A server in a process of its own, as in the field: started, looked at from outside, killed.
 
-Run as a module it is `probeless serve` with what no user is to have: frames side by side, and a device or a disk that
-fails. `python -m tests.bench.service.process '{"concurrent_frames": 2}' [OPTIONS OF serve]`; see `Unusual`.
+Run as a module it is `probeless serve` with what no user is to have: frames side by side, a device or a disk that
+fails, and kernels that are compiled when they are needed. `python -m tests.bench.service.process '{"concurrent_frames": 2}' [OPTIONS OF serve]`; see `Unusual`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -41,6 +41,8 @@ class Unusual:
     concurrent_frames: int = 1
     fault: str = ""
     """One of `service_injected.INJECTED`: it fails from the signal `BEGIN` to `END`."""
+    warms_up: bool = True
+    """False: it is ready before any kernel is, for tests that ask nothing of most of them."""
 
 
 @dataclass
@@ -188,7 +190,9 @@ def _serve_unusually(unusual: Unusual, arguments: list[str]) -> None:
         def __init__(self, *given: Any, **more: Any) -> None:
             super().__init__(*given, **{"concurrent_frames": unusual.concurrent_frames} | more)
 
-    with patch("server.service.serve.Service", Service):
+    with patch("server.service.serve.Service", Service), ExitStack() as changes:
+        if not unusual.warms_up:
+            changes.enter_context(patch("server.service.serve._warm_up", lambda _device: None))
         if unusual.fault:
             injected = INJECTED[unusual.fault]()
             signal.signal(BEGIN, lambda *_: injected.begin())

@@ -50,7 +50,8 @@ RAYS, REACHES_M = (81, 169, 32), (WHOLE_ROOM_M, THESIS_REACH_M)
 def configurations() -> Iterator[tuple[str, int, int, float]]:
     """Preset, rays, bands, length of rays."""
     for preset, rays, bands, ray_length_m in product(STRIDES, RAYS, range(2, MAX_SH_BANDS + 1), REACHES_M):
-        if STRIDES[preset] > 1 or bands in (2, 4, MAX_SH_BANDS):  # every pixel is slow, and bands do not depend on it
+        # Every pixel is slow, and bands depend neither on it nor on how far rays go.
+        if (STRIDES[preset] > 1 or bands in (2, 4, MAX_SH_BANDS)) and (ray_length_m == WHOLE_ROOM_M or bands == 4):
             yield preset, rays, bands, ray_length_m
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,13 @@ class Seen:
 
 def look(world_from_camera: Floats) -> Seen:
     """The scene from there. World axes are those of a camera that looks at the wall."""
+    return _look(np.asarray(world_from_camera, np.float64).tobytes())
+
+
+@cache
+def _look(pose: bytes) -> Seen:
+    """Of a pose's bytes: a test looks from a few places, a hundred times."""
+    world_from_camera = np.frombuffer(pose).reshape(4, 4)
     rays = _rays(SUBPIXELS) @ world_from_camera[:3, :3].T  # [h, w, s, s, 3], one metre ahead each
     origin = world_from_camera[:3, 3]
     apart = origin - BALL_M

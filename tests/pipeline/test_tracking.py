@@ -59,15 +59,16 @@ def test_sensor_noise_does_not_lead_away(open_geometry: Open) -> None:
     assert ate_rmse_m(found, truth) < 0.3 * VOXEL_M  # seen: 0.226, of noise of 6 mm, which is 0.3 voxel
 
 
-@pytest.mark.parametrize(("noise_m", "bound_m"), [(0.0, 5e-7), (0.003, 6e-4)])
+@pytest.mark.parametrize(("noise_m", "bound_m"), [(0.0, 2.5e-7), (0.003, 6e-4)])
 def test_a_camera_that_stands_still_does_not_drift(open_geometry: Open, noise_m: float, bound_m: float) -> None:
-    """Once the volume has settled. Seen: 8e-8 m (a float32 at 1.5 m ends at 1e-7) and 4.2e-4 m; in the means 7e-6 m."""
+    """Once the volume has settled. Seen: 1.2e-7 m (a float32 at 1.5 m ends at 1e-7) and 4.3e-4 m; 6e-9 m in means over
+    the same noise, 60 frames apart: less than 1e-7 m a frame."""
     geometry = open_geometry("track")
     view = view_at(5)
     frames = [frame_at(view, index, noise_m=noise_m, given=view) for index in range(20)]
-    found = [geometry.scan(frames[index % 20]).world_from_camera for index in range(300)]
+    found = [geometry.scan(frames[index % 20]).world_from_camera for index in range(150)]
     assert max(distance_between(pose, found[40]) for pose in found[40:]) < bound_m
-    assert distance_between(np.mean(found[-50:], axis=0), np.mean(found[40:90], axis=0)) < 2e-5
+    assert distance_between(np.mean(found[-50:], axis=0), np.mean(found[40:90], axis=0)) < 5e-6
 
 
 def test_given_poses_are_taken_as_they_are(open_geometry: Open) -> None:
@@ -175,14 +176,15 @@ def test_track_source_says_every_frames_pose_and_state(engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("name", "frames", "bound_m"),
     [
-        ("mitsuba_track_clean", 100, 0.0002),
-        ("mitsuba_track_noisy", 100, 0.0012),
-        ("rgbd_livingroom1_synth", 60, 0.01),
-        ("rgbd_7scenes_redkitchen", 60, 0.01),
+        ("mitsuba_track_clean", 50, 0.0002),
+        ("mitsuba_track_noisy", 50, 0.0012),
+        ("rgbd_livingroom1_synth", 40, 0.0075),
+        ("rgbd_7scenes_redkitchen", 40, 0.0087),
     ],
 )
 def test_trajectories_of_public_data(engine: Engine, name: str, frames: int, bound_m: float) -> None:
-    """Seen: 0.10, 1.13, 6.9 and 7.1 mm. The two rooms of real size drift with the frames; nothing closes loops."""
+    """Seen: 0.10, 1.09, 5.2 and 6.2 mm. The two rooms of real size drift with the frames; nothing closes loops. The cubes
+    do not: 100 frames of them are 0.10 and 1.13 mm off."""
     source = open_source(str(data_folder(name)))
     is_cube = name.startswith("mitsuba")
     volume = (0.0, 0.0, 0.1, 2.0, 2.0, 2.1) if is_cube else default_volume(source, range(len(source)))

@@ -25,14 +25,21 @@ BRUTE_DIRECTIONS = 40_000
 
 
 def brute_force(
-    solids: list[Solid], own: int, point: np.ndarray, normal: np.ndarray, directions: np.ndarray
+    solids: list[Solid],
+    own: int,
+    point: np.ndarray,
+    normal: np.ndarray,
+    directions: np.ndarray,
+    functions: np.ndarray,
 ) -> np.ndarray:
-    """[16] shadowed Lambert transfer at a point, one ray at a time through `intersect`."""
-    above = directions[directions @ normal > 0]
+    """[16] shadowed Lambert transfer at a point, one ray at a time through `intersect`. functions: of `directions`."""
+    cosines = directions @ normal
+    above = np.flatnonzero(cosines > 0)
     others = [s for i, s in enumerate(solids) if i != own or s.bounds is None]
-    nearest = np.min([solid.intersect(point, above) for solid in others], axis=0)
-    seen = above[np.isinf(nearest)]
-    return (basis(seen) * (seen @ normal)[:, None]).sum(axis=0) * 4 / len(directions)
+    seen = above
+    for solid in others:  # what one hides need not be looked for behind the next
+        seen = seen[np.isinf(solid.intersect(point, directions[seen]))]
+    return cosines[seen] @ functions[seen] * 4 / len(directions)
 
 
 def errors_at_pixels(source: SyntheticSource, index: int, count: int, dynamic: bool = False) -> np.ndarray:
@@ -42,6 +49,7 @@ def errors_at_pixels(source: SyntheticSource, index: int, count: int, dynamic: b
     solids = [*source.scene.solids, *hand]
     turn, _ = np.linalg.qr(random.normal(size=(3, 3)))
     directions = sphere_directions(BRUTE_DIRECTIONS) @ turn.T
+    functions = basis(directions)
     rows, columns = np.nonzero(truth.dynamic if dynamic else truth.visible & ~truth.dynamic)
     errors = []
     for k in random.choice(len(rows), count, replace=False):
@@ -51,7 +59,7 @@ def errors_at_pixels(source: SyntheticSource, index: int, count: int, dynamic: b
         point, normal = pose[:3, :3] @ in_camera + pose[:3, 3], truth.normals[v, u].astype(float)
         own = _owner(solids, point)
         # float32 depth: lifted by ten of its steps, so that the surface does not meet itself
-        expected = brute_force(solids, own, point + 1e-6 * normal, normal, directions) @ truth.sh
+        expected = brute_force(solids, own, point + 1e-6 * normal, normal, directions, functions) @ truth.sh
         got = truth.radiance[v, u] / truth.albedo[v, u]
         errors.append(np.abs(got - expected).max() / expected.max())
     return np.array(errors)

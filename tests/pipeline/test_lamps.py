@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
-from client.sources.volume import default_volume, default_voxel
-from client.synthetic.source import open_synthetic
+from client.sources.volume import Volume, default_volume, default_voxel
+from client.synthetic.source import SyntheticSource, open_synthetic
 from protocol.frames import CameraModel
 from protocol.messages import Wishes
 from server.client_session import ClientSession
@@ -28,9 +29,15 @@ FRAMES = range(0, 128, 2)
 CAMERA = CameraModel(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 
 
-def results_of(device: Device, spec: str, frames: range = FRAMES, **wishes: str) -> list[FrameResult]:
+@cache
+def source_of(spec: str) -> tuple[SyntheticSource, Volume]:
+    """A scene and its volume."""
     source = open_synthetic(f"synthetic:{spec}&size=160x120&frames=150")
-    bounds = default_volume(source, range(len(source)))
+    return source, default_volume(source, range(len(source)))
+
+
+def results_of(device: Device, spec: str, frames: range = FRAMES, **wishes: str) -> list[FrameResult]:
+    source, bounds = source_of(spec)
     asked = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), up=source.up, **PLAIN_LIGHT, **wishes)
     pipeline = ClientSession(device, source.camera, asked)
     try:

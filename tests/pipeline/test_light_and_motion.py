@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from client.options.source import open_source
-from client.sources.volume import default_volume, default_voxel
+from client.sources.volume import Volume, default_volume, default_voxel
 from client.synthetic.source import SyntheticSource
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
@@ -32,9 +33,15 @@ def table() -> SyntheticSource:
     return source
 
 
+@cache
+def bare_frames(source: SyntheticSource) -> tuple[list[RgbdFrame], Volume]:
+    """All frames of a source, and the volume around what they show: for every session."""
+    return list(source), default_volume(source, range(FRAMES))
+
+
 def with_ball(source: SyntheticSource, index: int, center: Floats, radius_m: float, holes: bool) -> RgbdFrame:
     """A frame with a ball in front, of one red, which no light explains. `holes`: blocks of it have no depth."""
-    frame, scale = source[index], source.camera.depth_scale_m
+    frame, scale = bare_frames(source)[0][index], source.camera.depth_scale_m
     near = look([sphere(center, radius_m)], source.camera, source.pose(index)).depth_m
     seen = (near > 0) & ((frame.depth == 0) | (near < frame.depth * scale))
     v, u = np.indices(near.shape)
@@ -45,14 +52,14 @@ def with_ball(source: SyntheticSource, index: int, center: Floats, radius_m: flo
 
 def lights(device: Device, source: SyntheticSource, way: Way | None, radius_m: float, holes: bool = False) -> Floats:
     """[frames, 16, 3] from frame FIRST on, when the ball comes; without one if there is no `way`."""
-    bounds = default_volume(source, range(FRAMES))
+    frames, bounds = bare_frames(source)
     pipeline = ClientSession(
         device, source.camera, Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset="reg4")
     )
     found = []
     for index in range(FRAMES):
         has_ball = index >= FIRST and way is not None
-        frame = with_ball(source, index, way(index - FIRST), radius_m, holes) if has_ball else source[index]
+        frame = with_ball(source, index, way(index - FIRST), radius_m, holes) if has_ball else frames[index]
         found.append(np.array(pipeline.process(frame).light.sh))
     pipeline.close()
     return np.array(found[FIRST:])

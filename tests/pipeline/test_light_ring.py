@@ -7,10 +7,12 @@ lacks.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
-from client.sources.volume import default_volume, default_voxel
+from client.sources.volume import Volume, default_volume, default_voxel
 from client.synthetic.lighting.lights import RING_SIZE
 from client.synthetic.source import SyntheticSource, open_synthetic
 from protocol.messages import Light, Wishes
@@ -30,9 +32,16 @@ def source_of(light: int) -> SyntheticSource:
     return open_synthetic(f"synthetic:table?light={light}&frames=90&size=320x240")
 
 
+@cache
+def volume_of_the_table() -> Volume:
+    """The one that `run` would choose: a matter of depth and poses, whatever the light."""
+    source = source_of(0)
+    return default_volume(source, range(len(source)))
+
+
 def estimates(device: Device, source: SyntheticSource) -> list[Light]:
-    """The light after each of FRAMES, with the volume that `run` would choose, of one albedo as the table is."""
-    volume_m = default_volume(source, range(len(source)))
+    """The light after each of FRAMES, of one albedo as the table is."""
+    volume_m = volume_of_the_table()
     wishes = Wishes(preset="reg4", volume_m=volume_m, voxel_m=default_voxel(volume_m), up=source.up, **PLAIN_LIGHT)
     pipeline = ClientSession(device, source.camera, wishes)
     found = [pipeline.process(source[index]).light for index in FRAMES]

@@ -92,8 +92,8 @@ class Box:
 
     def hit(self, origins: Floats, directions: Floats) -> Floats:
         slope = np.where(np.abs(directions) < 1e-12, 1e-12, directions)
-        a, b = (self.low - origins) / slope, (self.high - origins) / slope
-        enter, leave = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+        a, b = ((self.low - origins) / slope).T, ((self.high - origins) / slope).T
+        enter, leave = np.minimum(a, b).max(0), np.maximum(a, b).min(0)
         return np.where((enter <= leave) & (leave >= 0), np.maximum(enter, 0.0), np.inf)
 
     def grown(self, by_m: float) -> Box:

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from client.options.source import open_source
-from client.sources.volume import default_volume, default_voxel
+from client.sources.volume import Volume, default_volume, default_voxel
 from client.synthetic.source import SyntheticSource
 from protocol.frames import RgbdFrame
 from protocol.messages import Wishes
@@ -52,20 +52,20 @@ def _session(trial: Trial, frames: list[RgbdFrame], preset: str = "reg4") -> Fra
 
 
 @cache
-def _table() -> SyntheticSource:
+def _table() -> tuple[SyntheticSource, list[RgbdFrame], Volume]:
+    """The source, its frames and the volume around what they show: for every case and both its runs."""
     source = open_source(_TABLE)
     assert isinstance(source, SyntheticSource)
-    return source
+    return source, list(source), default_volume(source, range(len(source)))
 
 
 def _table_light(trial: Trial, preset: str, saturated: slice | None = None) -> Found:
     """Dominant direction after 12 frames, some columns of each picture saturated."""
-    source = _table()
-    bounds = default_volume(source, range(len(source)))
+    source, frames, bounds = _table()
     wishes = Wishes(volume_m=bounds, voxel_m=default_voxel(bounds), preset=preset, **PLAIN_LIGHT)
     pipeline = ClientSession(trial.device, source.camera, wishes)
     try:
-        for frame in source:
+        for frame in frames:
             color = frame.color.copy()
             if saturated is not None:
                 color[:, saturated] = 255
@@ -73,7 +73,7 @@ def _table_light(trial: Trial, preset: str, saturated: slice | None = None) -> F
     finally:
         pipeline.close()
     assert np.isfinite(light.sh).all()
-    return Found(unit(light.dominant_direction), source.truth(len(source) - 1).light_direction)
+    return Found(unit(light.dominant_direction), source.light(len(source) - 1).direction)
 
 
 for _name, _code in {"all black": 0, "all white": 255}.items():

@@ -111,7 +111,7 @@ def layer_screen_part(run: Run, _out: Path) -> Part:
         frames, seen = [source[i] for i in range(len(source))], Seen()
         with watched_server(run.device, seen) as server, impaired(server.url, DELAY_S) as link:
             page = _open(browser, link.url, source.camera, frames)
-            begin(page, "gr15fast")
+            begin(page)
             place_ball(page, source, seen)
             show_ball(page, source)
             page.wait_for_timeout(SETTLING_MS)

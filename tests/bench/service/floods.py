@@ -15,6 +15,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -180,7 +181,7 @@ def _flood(served: Served) -> None:
 
 def _bomb(served: Served, number: int) -> None:
     """Something small that grows when it is read."""
-    zeros = zlib.compress(bytes(64 << 20), 9)
+    zeros = _zeros()
     size = {"width": CAMERA["width"], "height": CAMERA["height"]}
     bombs: tuple[Callable[[], dict[str, object]], ...] = (
         lambda: frame(0, depth={**size, "codec": "zdelta", "data": zeros[2:-4]}),
@@ -194,6 +195,12 @@ def _bomb(served: Served, number: int) -> None:
             client.recv(timeout=PATIENCE_S)
 
 
+@cache
+def _zeros() -> bytes:
+    """64 MiB of them."""
+    return zlib.compress(bytes(64 << 20), 9)
+
+
 def _png_bomb() -> bytes:
     """A PNG of 30000 x 30000 black pixels that says it is one of the camera's size."""
 
@@ -201,8 +208,7 @@ def _png_bomb() -> bytes:
         return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
 
     sides = CAMERA["width"].to_bytes(4, "big") + CAMERA["height"].to_bytes(4, "big")  # type: ignore[attr-defined]
-    rows = zlib.compress(bytes(64 << 20), 9)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", sides + b"\x08\x02\0\0\0") + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", sides + b"\x08\x02\0\0\0") + chunk(b"IDAT", _zeros()) + chunk(b"IEND", b"")
 
 
 def _glb_bomb() -> bytes:

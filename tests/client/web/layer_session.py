@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Page
 
 from protocol.frames import RgbdFrame, Viewpoint
+from protocol.messages import Wishes
 from server.client_session import ClientSession, FrameTurn
 from server.opencl.device import Device
 from server.pipeline import FrameResult
@@ -21,10 +22,11 @@ from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.serve import BackgroundServer
 from server.service.service import Service
-from server.service.warm_up import warm_up
+from server.service.warm_up import _run
 from tests.client.web.page import wait_until
 from tests.client.web.red_ball import TurningTable, red_ball
 
+PRESET = "gr15fast"
 IS_RED = """(pixels) => pixels?.some((value, i) => {
   return i % 4 === 0 && value > 90 && value > 3 * pixels[i + 1] && value > 3 * pixels[i + 2];
 })"""
@@ -44,7 +46,8 @@ class Seen:
 
 @contextmanager
 def watched_server(device: Device, seen: Seen) -> Iterator[BackgroundServer]:
-    """The real service, which notes what comes. Its kernels are compiled, as those of any service that is ready."""
+    """The real service, which notes what comes. The kernels that these sessions need are compiled, as those of any
+    service that is ready."""
 
     class Watched(ClientSession):
         def process(
@@ -60,16 +63,16 @@ def watched_server(device: Device, seen: Seen) -> Iterator[BackgroundServer]:
             seen.is_placed.set()
             return notes
 
-    warm_up(device)
+    _run(device, Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, preset=PRESET, answer="layer"))
     with BackgroundServer(Service(device, pipeline_factory=Watched)) as server:
         yield server
 
 
-def begin(page: Page, preset: str, answer: str = "layer") -> None:
+def begin(page: Page) -> None:
     """Start the session of a page that has its device."""
     page.locator("input[name=source][value=xr]").check()
-    page.locator("[name=answer]").select_option(answer)
-    page.locator("[name=preset]").select_option(preset)
+    page.locator("[name=answer]").select_option("layer")
+    page.locator("[name=preset]").select_option(PRESET)
     page.locator("#start").click()
     page.locator("#picture-caption").filter(has_text="Frame").wait_for(state="attached")
 

@@ -107,13 +107,15 @@ def watching(page: Page, url: str) -> Iterator[str]:
 
 
 def look(page: Page, keep_picture: Callable[[Page, str], None], mode: str) -> list[str]:
-    """What is wrong with a mode in each size."""
-    found = []
+    """What is wrong with a mode in each size, with a picture of each that has a fault."""
+    found: list[str] = []
     for size, (width, height) in SIZES.items():
         page.set_viewport_size({"width": width, "height": height})
         page.evaluate("scrollTo(0, 0)")
-        found += [f"{mode}, {size}: {fault}" for fault in (*page.evaluate(FAULTS), *page.evaluate(VIOLATIONS))]
-        keep_picture(page, f"mode-{mode}-{width}")
+        faults = (*page.evaluate(FAULTS), *page.evaluate(VIOLATIONS))
+        found += [f"{mode}, {size}: {fault}" for fault in faults]
+        if faults:
+            keep_picture(page, f"mode-{mode}-{width}")
     return found
 
 

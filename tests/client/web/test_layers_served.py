@@ -36,7 +36,7 @@ def test_a_ball_placed_by_touch_stays_where_it_stands_while_the_camera_turns(
     seen, frames = Seen(), [source[i] for i in range(len(source))]
     with watched_server(device, seen) as server, impaired(server.url, DELAY_S) as link:
         page = open_page(link.url, of_device(source.camera, frames) | {"fps": 1e-6}, size=(600, 800))
-        begin(page, "gr15fast")
+        begin(page)
         place_ball(page, source, seen)
         show_ball(page, source)
         drawn = len(seen.frames) + 10

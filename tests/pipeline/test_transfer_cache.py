@@ -197,7 +197,8 @@ def test_a_real_kitchen_is_lit_the_same_and_shown_nearly_so(
     for cached, exact in zip(found["on"], found["off"], strict=True):
         assert cached.light.sh == exact.light.sh
         assert [at.sh for at in cached.light.at] == [at.sh for at in exact.light.at]
-    for some, others in zip(*(pictures_of(found[cache]) for cache in ("on", "off")), strict=True):
+    # Every second one, for what FLIP takes of a picture this large; the first is that without, as above.
+    for some, others in zip(*(pictures_of(found[cache])[1::2] for cache in ("on", "off")), strict=True):
         assert flip_map(some, others).mean() < 0.0045  # seen: 0.0024; the goal is 0.01
 
 

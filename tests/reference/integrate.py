@@ -35,7 +35,8 @@ def depth_at(pixels: Floats, depth_m: Floats, edge_m: float) -> Floats:
     corners, weights = [], []
     for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
         corners.append(depth_m[low[..., 1] + dy, low[..., 0] + dx])
-        weights.append(np.where((dx, dy), share, 1 - share).prod(-1))
+        across, down = (share[..., axis] if there else 1 - share[..., axis] for axis, there in enumerate((dx, dy)))
+        weights.append(across * down)
     one_surface = (np.min(corners, axis=0) > 0) & (np.ptp(corners, axis=0) < edge_m)
     return np.where(one_surface, (np.array(corners) * weights).sum(0), depth_m[v, u])
 
@@ -47,7 +48,8 @@ def signed_distance(camera: CameraModel, points: Floats, depth_m: Floats, edge_m
     """
     pixels = project(camera, points)
     seen = ((pixels >= -0.5) & (pixels < (camera.width - 0.5, camera.height - 0.5))).all(-1)
-    depth = depth_at(np.where(seen[..., None], pixels, 0), depth_m, edge_m)
+    depth = np.zeros(seen.shape)
+    depth[seen] = depth_at(pixels[seen], depth_m, edge_m)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (depth - points[..., 2]) * np.linalg.norm(points, axis=-1) / points[..., 2]
     return np.where(seen & (depth > 0), distance, np.nan)

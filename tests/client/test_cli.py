@@ -114,8 +114,7 @@ def test_what_cannot_be_done_ends_with_1(words: list[str], error: str, tmp_path:
 
 
 def test_the_installed_program_ends_so_too(tmp_path: Path) -> None:
-    """`serve` ends its process itself, whatever threads are left, so it has one of its own here."""
-    assert_one_line(probeless_process("fly"), 2, "No such command")
+    """`serve` ends its process itself, whatever threads are left, so it has one of its own here; `run` below."""
     assert_one_line(
         probeless_process("serve", "--device", "no such device", "--port", "0"), 1, "no OpenCL device is called"
     )

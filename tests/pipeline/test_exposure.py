@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import trimesh
 
 from client.options.source import open_source
 from client.sources.volume import default_volume, default_voxel
+from client.synthetic.render import Rendering
 from client.synthetic.source import SyntheticSource
 from protocol.messages import Light, Wishes
 from server.client_session import ClientSession
@@ -29,9 +32,21 @@ SETTLED = slice(6, None)
 """Of FRAMES: the light has been looked at from several sides."""
 
 
-def table(more: str = "") -> SyntheticSource:
-    source = open_source(f"synthetic:table?frames=60&size=160x120&light=1{more}")
+TABLE = "synthetic:table?frames=60&size=160x120&light=1"
+
+
+@cache
+def renderings() -> Callable[[int], Rendering]:
+    """What the camera sees of the table in each frame, rendered once for all exposures."""
+    source = open_source(TABLE)
     assert isinstance(source, SyntheticSource)
+    return cache(source._render)
+
+
+def table(more: str = "") -> SyntheticSource:
+    source = open_source(f"{TABLE}{more}")
+    assert isinstance(source, SyntheticSource)
+    source._rendering = renderings()
     return source
 
 

@@ -183,8 +183,8 @@ def test_track_source_says_every_frames_pose_and_state(engine: Engine) -> None:
     ],
 )
 def test_trajectories_of_public_data(engine: Engine, name: str, frames: int, bound_m: float) -> None:
-    """Seen: 0.10, 1.09, 5.2 and 6.2 mm. The two rooms of real size drift with the frames; nothing closes loops. The cubes
-    do not: 100 frames of them are 0.10 and 1.13 mm off. With one iteration a level the clean one is 0.18 mm off."""
+    """Seen: 0.10, 1.09, 5.2 and 6.2 mm. The two rooms of real size drift with the frames; nothing closes loops. The
+    cubes do not: 100 frames of them are 0.10 and 1.13 mm off. With one iteration a level, the clean one is 0.18."""
     source = open_source(str(data_folder(name)))
     is_cube = name.startswith("mitsuba")
     volume = (0.0, 0.0, 0.1, 2.0, 2.0, 2.1) if is_cube else default_volume(source, range(len(source)))

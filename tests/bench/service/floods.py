@@ -197,7 +197,7 @@ def _bomb(served: Served, number: int) -> None:
 
 @cache
 def _zeros() -> bytes:
-    """64 MiB of them."""
+    """64 MiB, compressed."""
     return zlib.compress(bytes(64 << 20), 9)
 
 
@@ -208,7 +208,8 @@ def _png_bomb() -> bytes:
         return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
 
     sides = CAMERA["width"].to_bytes(4, "big") + CAMERA["height"].to_bytes(4, "big")  # type: ignore[attr-defined]
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", sides + b"\x08\x02\0\0\0") + chunk(b"IDAT", _zeros()) + chunk(b"IEND", b"")
+    rows = _zeros()
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", sides + b"\x08\x02\0\0\0") + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
 def _glb_bomb() -> bytes:

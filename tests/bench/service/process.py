@@ -1,7 +1,8 @@
 """A server in a process of its own, as in the field: started, looked at from outside, killed.
 
 Run as a module it is `probeless serve` with what no user is to have: frames side by side, a device or a disk that
-fails, and kernels that are compiled when they are needed. `python -m tests.bench.service.process '{"concurrent_frames": 2}' [OPTIONS OF serve]`; see `Unusual`.
+fails, and kernels that are compiled only when they are needed.
+`python -m tests.bench.service.process '{"concurrent_frames": 2}' [OPTIONS OF serve]`; see `Unusual`.
 """
 
 from __future__ import annotations

@@ -26,15 +26,16 @@ def warm_up(device: Device) -> None:
     Raises CheckFailed if the self-check finds a wrong result.
     """
     wishes = Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, answer="layer")
-    _run(device, wishes)
-    _run(device, structs.replace(wishes, as_thesis=True))
-    _run(device, structs.replace(wishes, albedo="constant", indirect="none"))  # with a search for lamps
-    _run(device, structs.replace(wishes, preset="art4"))
-    _run(device, structs.replace(wishes, preset="gr15fast", light=SHARP_LIGHT))
+    compile_for(device, wishes)
+    compile_for(device, structs.replace(wishes, as_thesis=True))
+    compile_for(device, structs.replace(wishes, albedo="constant", indirect="none"))  # with a search for lamps
+    compile_for(device, structs.replace(wishes, preset="art4"))
+    compile_for(device, structs.replace(wishes, preset="gr15fast", light=SHARP_LIGHT))
     check_answers(device)
 
 
-def _run(device: Device, wishes: Wishes) -> None:
+def compile_for(device: Device, wishes: Wishes) -> None:
+    """The kernels that sessions with these wishes need, by small frames with an object."""
     pipeline = ClientSession(device, CAMERA, wishes)
     pipeline.place_object("warm-up", triangle(), Placement(position_m=(0.0, 0.0, 0.8)))
     frame = RgbdFrame(

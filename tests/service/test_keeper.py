@@ -139,12 +139,12 @@ def test_the_kept_token_counts_where_none_was_given() -> None:
     assert authenticator_of(ServeOptions("127.0.0.1", token="own", new_token="kept")).token == "own"
 
 
-COLD = "from server.service import serve; serve._warm_up = lambda device: None; from client.cli import main; main()"
+COLD = ("-m", "tests.bench.service.process", '{"warms_up": false}')
 """The program, but that it compiles no kernel before it is ready: that takes ten seconds, twice, and no frame comes."""
 
 
 def test_the_program_is_back_at_its_address_after_a_crash(device: Device, tmp_path: Path) -> None:
-    program = [sys.executable, "-c", COLD, "serve", "--device", device.name]
+    program = [sys.executable, *COLD, "--device", device.name]
     process = subprocess.Popen(
         [*program, "--port", "0", "--token", "none", "--data", "none"],
         cwd=ROOT,

@@ -24,10 +24,13 @@ from server.pipeline import FrameResult
 from tests.bench.light.environment import irradiance_error
 from tests.bench.report.finished import Part
 from tests.bench.report.run import Run, data_source
-from tests.bench.speed.suite import kitchen_stage
+from tests.bench.speed.suite import KITCHEN, kitchen_stage
 
 FPS = 15
 QUICK_FRAMES, FRAMES = {"bandwidth": 10, "cost": 26}, {"bandwidth": 40, "cost": 60}
+SETTLED = 20
+"""Frames after which light is compared: after fewer, little of the room was seen, and whatever changes in them turns
+the light at the object by tens of degrees."""
 KINECT_NOISE_PER_M = 0.00285
 """One step of its disparity, an eighth of a pixel at 585 px and 7.5 cm: what one and the same point flickers by."""
 OAK_BASELINE_M = 0.075
@@ -53,10 +56,6 @@ def oak_noise_per_m(camera: CameraModel) -> float:
     return OAK_DISPARITY_NOISE_PX / (camera.fx * OAK_BASELINE_M)
 
 
-SETTLED = 20
-"""Frames after which light is compared: after fewer, little of the room was seen, and whatever changes in them turns
-the light at the object by tens of degrees."""
-
 Seen = tuple[NDArray[np.uint8], NDArray[np.float64]]
 """Picture of one frame, and the light at the virtual object."""
 
@@ -75,7 +74,7 @@ def depth_mbit_per_s(frames: list[RgbdFrame], camera: CameraModel, coding: Codin
 
 def kitchen() -> Source:
     """7-Scenes' kitchen. Raises UnmeasurableError where it is not."""
-    return data_source("rgbd_7scenes_redkitchen")
+    return data_source(KITCHEN)
 
 
 def psnr_db(picture: NDArray[np.uint8], truth: NDArray[np.uint8]) -> float:

@@ -22,7 +22,7 @@ from server.scene.mesh import Mesh
 from server.scene.placement import Placement
 from server.service.serve import BackgroundServer
 from server.service.service import Service
-from server.service.warm_up import _run
+from server.service.warm_up import compile_for
 from tests.client.web.page import wait_until
 from tests.client.web.red_ball import TurningTable, red_ball
 
@@ -63,7 +63,7 @@ def watched_server(device: Device, seen: Seen) -> Iterator[BackgroundServer]:
             seen.is_placed.set()
             return notes
 
-    _run(device, Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, preset=PRESET, answer="layer"))
+    compile_for(device, Wishes(volume_m=(-1, -1, 0, 1, 1, 2), voxel_m=0.02, preset=PRESET, answer="layer"))
     with BackgroundServer(Service(device, pipeline_factory=Watched)) as server:
         yield server
 

@@ -14,6 +14,7 @@ from msgspec import Meta, Struct
 
 from protocol.frames import GREATEST_PLACE_M, CameraModel, ColorEncoding, check_physical, check_rigid
 from protocol.limits import (
+    FEW_INFLIGHT,
     MAX_IMAGE_PIXELS,
     MAX_IMAGE_SIDE_PX,
     MAX_LIGHT_PLACES,
@@ -25,6 +26,7 @@ from protocol.limits import (
     MAX_REASON_CHARS,
     MAX_SCENE_MESH_BYTES,
     MAX_SH_BANDS,
+    MOST_INFLIGHT,
 )
 
 Side = Annotated[int, Meta(ge=1, le=MAX_IMAGE_SIDE_PX)]
@@ -287,6 +289,11 @@ class Hello(Message, frozen=True, kw_only=True, omit_defaults=True, tag="hello")
     """Marker that aligns the client's world with the room's once it has been detected in both."""
     keep_s: Annotated[float, Meta(ge=0, le=300)] = 0.0
     """How long the session survives a connection that is lost without a bye; 0: not at all."""
+    max_inflight: Annotated[int, Meta(ge=1, le=MOST_INFLIGHT)] = FEW_INFLIGHT
+    """Frames that the client would have unanswered at most. The default keeps a server busy that is near.
+
+    More are for a client that is far and sends no frame before its turn: who fills a larger window sees older pictures.
+    """
     resume: Name | None = None
     """`welcome.key` of a session to resume. It continues unchanged; all other fields of this message are ignored."""
 
@@ -486,7 +493,7 @@ class Welcome(Message, frozen=True, kw_only=True, omit_defaults=True, tag="welco
     device: str
     """Name of the device that computes."""
     max_inflight: int
-    """Number of frames that the client may have unanswered."""
+    """Number of frames that the client may have unanswered; at most as many as it asked for."""
     key: str | None = None
     """Secret key to resume the session (`hello.resume`), if the client set `keep_s`."""
     resumed: bool = False

@@ -36,6 +36,7 @@ from client.streaming.coding import Coding, picture_bytes
 from client.streaming.video import IS_POSSIBLE, VideoEncoder
 from protocol.frames import CameraModel, RgbdFrame
 from protocol.images import decode_color
+from protocol.limits import FEW_INFLIGHT, MOST_INFLIGHT
 from protocol.messages import (
     NOT_SAVED,
     ClientMessage,
@@ -201,7 +202,10 @@ class _Stream:
         client = await StreamClient.connect(self._job.server_url, tap, self._job.access)
         try:
             job = self._job
-            welcome = await client.hello(job.source.camera, job.wishes, "probeless stream", job.room)
+            window = FEW_INFLIGHT if self._adaptive is None else MOST_INFLIGHT
+            welcome = await client.hello(
+                job.source.camera, job.wishes, "probeless stream", job.room, max_inflight=window
+            )
             self._note_welcome(welcome)
             if job.sending.video and not job.wishes.lossless:
                 client.video = open_video(welcome)

@@ -4,7 +4,7 @@ Network time of a frame = round trip - computing on the server - waiting on the 
 for a device that other sessions use). The part above the link's delay is transfer time; it gives the throughput.
 
 - *Rate*: the next frame is sent when the slowest of computing, sending and returning has finished the previous frame.
-  So no frame ages in a queue, and the client always sends its newest frame.
+  So no frame ages in a queue, and the client always sends its newest frame. Over a far link several are under way.
 - *Quality*: the highest rung of `LADDER` whose transfer takes less than `SHARE` of the frame interval (of the source,
   or of the server if that is slower), and at most `SHARE * LONGEST_TRANSFER_S`.
 - *Recovery*: after a failed step up, the next attempt waits longer, up to `MOST_GOOD_ANSWERS` frames.
@@ -70,7 +70,7 @@ class Adaptive:
         self._rung = 0
         self._network_times: deque[float] = deque(maxlen=WINDOW)
         self._last_answer_s, self._last_computed_s = -math.inf, 0.0
-        self._computed_s = self._network_s = 0.0
+        self._computed_s = self._network_s = self._interval_s = 0.0
         self._transfer_s = 0.0
         self._bytes_up = self._bytes_down = 0.0
         self._bad = self._good = 0
@@ -101,11 +101,25 @@ class Adaptive:
         one_way_s = self._transfer_s * _greater_share(self._bytes_up, self._bytes_down)
         return max(self._computed_s, one_way_s)
 
+    @property
+    def most_in_flight(self) -> int:
+        """Frames under way while one is computed and answered, if each is sent in its turn; at least 2.
+
+        An answer that is late is no reason to send more.
+        """
+        return max(2, math.ceil((self._network_s + self.busy_s) / max(self._source_interval_s, self.busy_s)))
+
     def may_send(self, now_s: float, last_sent_s: float, unanswered: int) -> bool:
-        """Whether a frame sent now would wait in no queue. The caller keeps the source's frame rate."""
-        # The server began the frame in flight when it was sent, or when the previous answer left.
-        begun_s = max(last_sent_s, self._last_answer_s - self._network_s)
-        return unanswered == 0 or (unanswered == 1 and now_s - begun_s >= self.busy_s)
+        """Whether a frame sent now would wait in no queue. The caller keeps the source's frame rate and the window."""
+        if unanswered == 0:
+            return True
+        if unanswered >= self.most_in_flight:
+            return False
+        # The server began the last frame when it was sent, or when those before it were done, one after another, since
+        # the last answer left. Each takes what answers are apart: a turn that others have is not in `busy_s`.
+        before_s = (unanswered - 1) * max(self._interval_s, self.busy_s)
+        begun_s = max(last_sent_s, self._last_answer_s - self._network_s + before_s)
+        return now_s - begun_s >= self.busy_s
 
     def note(self, frame: AnsweredFrame) -> None:
         """Take the measurement of an answered frame and choose the rung."""
@@ -113,6 +127,9 @@ class Adaptive:
         if waited_s is None:  # behind the previous frame, if that was unanswered when this one was sent
             waited_s = min(max(self._last_answer_s - frame.sent_s, 0.0), self._last_computed_s)
         network_s = max(frame.answered_s - frame.sent_s - frame.computed_s - waited_s, 0.0)
+        interval_s = frame.answered_s - self._last_answer_s
+        if interval_s < math.inf:
+            self._interval_s += SMOOTHING * (interval_s - self._interval_s)
         self._last_answer_s, self._last_computed_s = frame.answered_s, frame.computed_s
         self._network_times.append(network_s)
         transfer_s = max(network_s - min(self._delay_s, *self._network_times), 0.0)

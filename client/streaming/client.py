@@ -19,6 +19,7 @@ from client.streaming.opening import ClientError, open_client_socket
 from client.streaming.video import VideoEncoder
 from protocol.codec import ProtocolError, decode_server, encode
 from protocol.frames import CameraModel, RgbdFrame
+from protocol.limits import FEW_INFLIGHT
 from protocol.messages import (
     Acknowledged,
     Bye,
@@ -173,10 +174,12 @@ class StreamClient:
         client: str = "probeless",
         room: RoomPlace | None = None,
         keep_s: float = KEEP_S,
+        max_inflight: int = FEW_INFLIGHT,
     ) -> Welcome:
         """Begin to capture; returns when the server has prepared the session. Raises ClientError if it refuses.
 
         `room`: the room to share; None: a room of its own. `keep_s`: how long the session survives a lost connection.
+        `max_inflight`: how many frames may be unanswered, 1 to 8; more than 2 only with pacing (`adaptive`).
         """
         place = room or RoomPlace("")
         self._hello = Hello(
@@ -188,6 +191,7 @@ class StreamClient:
             room_from_world=place.room_from_world,
             marker=place.marker,
             keep_s=keep_s,
+            max_inflight=max_inflight,
         )
         await self._send(self._hello)
         return await self._wait_for_welcome()

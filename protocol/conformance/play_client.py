@@ -221,8 +221,9 @@ def _drops_wrong_pictures(dial: Dial) -> None:
 @_rule("each of max_inflight frames gets exactly one answer", "Flow control")
 def _answers_window(dial: Dial) -> None:
     socket = dial()
-    socket.say(hello())
+    socket.say(hello(max_inflight=5))
     window = socket.hear_a("welcome")["max_inflight"]
+    _require(1 <= window <= 5, f"max_inflight {window}, of 5 that were asked for")
     answered: list[int] = []
     for number in range(window):
         socket.say(frame(number))

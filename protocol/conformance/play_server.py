@@ -20,7 +20,7 @@ from websockets.typing import Subprotocol
 from protocol.codec import ProtocolError, decode_client, encode
 from protocol.conformance.report import Line
 from protocol.conformance.scene import IDENTITY, grey_png
-from protocol.limits import SUBPROTOCOL
+from protocol.limits import FEW_INFLIGHT, SUBPROTOCOL
 from protocol.messages import (
     Acknowledged,
     ColorImage,
@@ -37,7 +37,6 @@ from protocol.messages import (
     Welcome,
 )
 
-MAX_INFLIGHT = 2
 PAUSE_S = 0.05
 """A client that sends nothing for so long waits for answers."""
 DROPPED_EVERY = 5
@@ -67,6 +66,7 @@ class Session:
         self.hello: Hello | None = None
         self.is_greeted = False
         self.unanswered = 0
+        self.window = FEW_INFLIGHT
         self._last: Frame | None = None
         self._requests: dict[int, object] = {}
 
@@ -107,14 +107,14 @@ class Session:
     def _greet(self, message: Hello | Watch) -> list[ServerMessage]:
         self.is_greeted = True
         self.hello = message if isinstance(message, Hello) else None
-        welcome = Welcome(session="conformance", server="conformance", device="none", max_inflight=MAX_INFLIGHT)
-        return [welcome]
+        self.window = FEW_INFLIGHT if self.hello is None else self.hello.max_inflight
+        return [Welcome(session="conformance", server="conformance", device="none", max_inflight=self.window)]
 
     def _answer(self, frame: Frame) -> list[ServerMessage]:
         if self.hello is None:
             return [Dropped(frame=frame.frame, reason="there was no hello")]
         self.unanswered += 1
-        if self.unanswered > MAX_INFLIGHT:
+        if self.unanswered > self.window:
             self.note("window", f"{self.unanswered} unanswered")
         self._check_order(frame)
         self._check_pictures(frame, self.hello)

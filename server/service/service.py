@@ -18,6 +18,7 @@ from protocol.codec import encode, one_line
 from protocol.colors import readable_codecs
 from protocol.frames import CameraModel
 from protocol.images import DEPTH_CODECS
+from protocol.limits import FEW_INFLIGHT
 from protocol.messages import Acknowledged, Bye, Hello, Watch, Welcome, Wishes
 from server.parsing.parsers import Parsers
 from server.scene.mesh import Mesh
@@ -43,7 +44,7 @@ from server.service.room_registry import RoomFactory, RoomRegistry, key_digest_o
 from server.service.saving.retention import StorageUsage
 from server.service.saving.room_persistence import RoomPersistence
 from server.service.scheduler import Scheduler
-from server.service.session import MAX_INFLIGHT, CaptureSession, EventLoopOutbox
+from server.service.session import CaptureSession, EventLoopOutbox
 from server.service.worker import WorkerContext, not_saved
 
 if TYPE_CHECKING:
@@ -296,7 +297,7 @@ class Service:
                 session=name,
                 server=SERVER_NAME,
                 device="",
-                max_inflight=MAX_INFLIGHT,
+                max_inflight=hello.max_inflight,
                 key=key,
                 room=hello.room,
                 codecs=readable_codecs(),
@@ -378,7 +379,7 @@ class Service:
             self.metrics.sessions.set(self._sessions)
 
     async def _watch(self, connection: Connection, watch: Watch) -> None:
-        waiting = Welcome(session=NO_SESSION, server=SERVER_NAME, device=self.device_name, max_inflight=MAX_INFLIGHT)
+        waiting = Welcome(session=NO_SESSION, server=SERVER_NAME, device=self.device_name, max_inflight=FEW_INFLIGHT)
         with (
             self._counted_watcher(),
             self._broadcast.watcher(

@@ -26,8 +26,8 @@ from server.service.edge.connection import (
 from server.service.mailbox import Mailbox, Order
 from server.service.worker import Worker, WorkerContext
 
-MAX_INFLIGHT = 2
-FAR_TOO_MANY_INFLIGHT = 4 * MAX_INFLIGHT
+FAR_TOO_MANY = 4
+"""Windows of frames sent ahead of which the client is told."""
 
 log = logging.getLogger(__name__)
 
@@ -154,7 +154,8 @@ class CaptureSession:
         self._loop = asyncio.get_running_loop()
         self._mailbox_has_space = asyncio.Event()
         self._told_of_window = False
-        self._mailbox = Mailbox(None if hello.wishes.lossless else MAX_INFLIGHT, self._wake_reader)
+        self._max_inflight = hello.max_inflight
+        self._mailbox = Mailbox(None if hello.wishes.lossless else hello.max_inflight, self._wake_reader)
         self._worker = Worker(context, hello, self._mailbox, outbox)
         self._returned: asyncio.Future[Connection] | None = None
         """Set while the connection is lost; its result is the client's new connection."""
@@ -310,7 +311,7 @@ class CaptureSession:
             self._worker.begin_reading()
         if receipt.replaced is not None:
             await self._say_replaced(receipt.replaced)
-        if receipt.frames_ahead > FAR_TOO_MANY_INFLIGHT and not self._told_of_window:
+        if receipt.frames_ahead > FAR_TOO_MANY * self._max_inflight and not self._told_of_window:
             self._told_of_window = True
             await self._say_too_many(receipt.frames_ahead)
 
@@ -319,7 +320,8 @@ class CaptureSession:
         await self._connection.send_message(Dropped(frame=frame.frame, reason="replaced by a newer frame"))
 
     async def _say_too_many(self, frames: int) -> None:
-        reason = f"{frames} frames were sent ahead: keep at most {MAX_INFLIGHT} unanswered (welcome.max_inflight)"
+        most = self._max_inflight
+        reason = f"{frames} frames were sent ahead: keep at most {most} unanswered (welcome.max_inflight)"
         await self._connection.send_message(Error(reason=reason, fatal=False))
 
 

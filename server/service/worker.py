@@ -56,8 +56,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_ACKNOWLEDGEMENTS = 256
-MAX_ANSWERS = 4
-"""More than the frames a client may have unanswered (session.MAX_INFLIGHT)."""
 
 SaveRoom = Callable[[str], str | None]
 """Saves the room of that name and returns why it could not, one line for the client, or None."""
@@ -130,8 +128,8 @@ class Worker:
         self._load_shedding = LoadShedding(hello.wishes, context.target_period_s)
         self._acknowledged: OrderedDict[int, Acknowledged] = OrderedDict()
         """Acknowledgements by request number: a client that lost its connection may repeat requests."""
-        self._answers: deque[tuple[int, tuple[bytes, ...]]] = deque(maxlen=MAX_ANSWERS)
-        """Last answers of a lossless session by frame number, which may be requested again."""
+        self._answers: deque[tuple[int, tuple[bytes, ...]]] = deque(maxlen=hello.max_inflight)
+        """Last answers of a lossless session by frame number: those that the client may not have had."""
 
     def run(self) -> None:
         """Build the pipeline, welcome the client, and process messages until the mailbox closes.

@@ -63,7 +63,7 @@ def _measured(
 def _asked(random: np.random.Generator, adaptive: Adaptive, frame: AnsweredFrame) -> dict[str, Any]:
     """At any moment, and beside the one at which the answer changes."""
     sent_s = frame.answered_s - float(random.uniform(0, 0.2))
-    unanswered = int(random.choice([0, 1, 1, 1, 2]))
+    unanswered = int(random.choice([0, 1, 1, 1, 2, 2, 3]))
     asked_s = (
         sent_s + adaptive.busy_s * float(random.choice([0.5, 0.999, 1.001, 1.5])) + float(random.choice([0, 0.01]))
     )

@@ -10,12 +10,14 @@ from statistics import median
 import pytest
 
 from client.streaming.adaptive import LADDER, Adaptive, AnsweredFrame
+from protocol.limits import MOST_INFLIGHT
 
 FPS = 15
 DEPTH_BYTES = 80_000
 COLOR_BYTES = (60_000, 43_000, 33_000, 23_000, 13_000, 9_000)
 """About what the kitchen takes, by rung."""
 ANSWER_BYTES = 40_000
+LARGEST_BYTES = DEPTH_BYTES + COLOR_BYTES[0]
 
 
 @dataclass
@@ -60,7 +62,7 @@ def stream(adaptive: Adaptive, link: Link, seconds: float, start_s: float = 0.0,
             done.append(frame)
             link.ages_s.append(frame.answered_s - frame.sent_s)
         if adaptive.may_send(now_s, last_s, len(under_way)) and now_s - last_s >= 1 / FPS:
-            assert len(under_way) < 2
+            assert len(under_way) < MOST_INFLIGHT
             frame = link.send(now_s, color[adaptive.rung] + DEPTH_BYTES)
             heapq.heappush(under_way, (frame.answered_s, frame))
             last_s = now_s
@@ -183,7 +185,19 @@ def test_distance_is_no_reason_for_worse_pictures() -> None:
     adaptive, link = Adaptive(1 / FPS, delay_s=0.2), Link(100e6 / 8, delay_s=0.1)
     done = stream(adaptive, link, 10)
     assert adaptive.rung == 0
-    assert len(done) >= 0.55 * 10 * FPS  # the window holds two
+    assert len(done) >= 0.95 * 10 * FPS
+    assert max(link.ages_s) < 0.2 + link.computed_s + 1.1 * (LARGEST_BYTES + ANSWER_BYTES) / link.bytes_per_s
+
+
+def test_a_far_device_that_others_use_gets_no_queue_of_frames() -> None:
+    adaptive, link = Adaptive(1 / FPS, delay_s=0.2), Link(100e6 / 8, delay_s=0.1, says_wait=True)
+    stream(adaptive, link, 10)
+    assert adaptive.most_in_flight > 2
+    link.turn_s = 1.0  # from one frame to the next
+    stream(adaptive, link, 20, start_s=10)
+    turns = max(link.ages_s) - 2 * link.delay_s
+    assert turns < (adaptive.most_in_flight + 0.5) * link.turn_s  # eight, if it sent what the server's window holds
+    assert median(link.ages_s[-10:]) - 2 * link.delay_s < 2.5 * link.turn_s
 
 
 def test_throughput_is_told() -> None:

@@ -48,23 +48,25 @@ def test_frames_come_back_with_light_and_picture(server) -> None:
     with_client(server.url, talk)
 
 
-def test_window_holds_back_a_third_frame(server, lab) -> None:
+@pytest.mark.parametrize("window", [2, 5])
+def test_window_holds_back_the_frame_after_it(server, lab, window: int) -> None:
     lab.hold = True
 
     async def talk(client: StreamClient) -> None:
-        await client.hello(CAMERA)
-        assert client.has_room
-        await client.send_frame(rgbd_frame(0))
-        await client.send_frame(rgbd_frame(1))
+        welcome = await (client.hello(CAMERA) if window == 2 else client.hello(CAMERA, max_inflight=window))
+        assert welcome.max_inflight == window
+        for number in range(window):
+            assert client.has_room
+            await client.send_frame(rgbd_frame(number))
         assert not client.has_room
-        third = asyncio.create_task(client.send_frame(rgbd_frame(2)))
+        next_one = asyncio.create_task(client.send_frame(rgbd_frame(window)))
         assert await asyncio.to_thread(lab.next_entered) == 0
-        assert not third.done()
+        assert not next_one.done()
         lab.release()
-        await third
-        lab.release(2)
+        await next_one
+        lab.release(window)
         await client.wait_until_answered()
-        assert [(await next_answer(client)).composite.frame for _ in range(3)] == [0, 1, 2]
+        assert [(await next_answer(client)).composite.frame for _ in range(window + 1)] == list(range(window + 1))
 
     with_client(server.url, talk)
 

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from client.streaming.client import Answer, ClientError, RoomPlace, StreamClient
+from protocol.limits import MOST_INFLIGHT
 from protocol.messages import Acknowledged, Composite, Dropped, Hello, Light, MoveObject, PlaceObject, Welcome, Wishes
 from server.service.serve import BackgroundServer
 from tests.service.fakes import CAMERA, EXPLODE_MM, PATIENCE_S, Lab, frame_message, rgbd_frame
@@ -119,8 +120,13 @@ def test_a_client_that_keeps_to_its_window_loses_no_frame_after_a_resume(server,
 def until_queued(server: BackgroundServer, count: int) -> None:
     """Wait until so many messages wait for the session's worker."""
     (session,) = server.service._captures.values()
+    until(lambda: len(session._mailbox._messages) >= count)
+
+
+def until(is_so: Callable[[], bool]) -> None:
+    """Wait for that."""
     end_s = time.monotonic() + PATIENCE_S
-    while len(session._mailbox._messages) < count:
+    while not is_so():
         assert time.monotonic() < end_s
         time.sleep(0.01)
 
@@ -276,6 +282,28 @@ def test_a_frame_that_is_sent_again_while_it_is_worked_on_is_answered_once(proxy
     taken = asyncio.run(cut_while_it_works())
     assert [found.light.frame for found in taken] == [0, 1, 2]
     assert [entry[1] for entry in lab.log if entry[0] == "frame"] == [0, 1, 2]
+
+
+def test_a_whole_window_of_answers_that_were_lost_is_sent_again(server, proxy: Proxy, lab: Lab) -> None:
+    first = Wire(proxy.url)
+    welcome = greet(first, wishes=Wishes(lossless=True), max_inflight=MOST_INFLIGHT)
+    frames = [frame_message(number) for number in range(MOST_INFLIGHT)]
+    lab.hold = True
+    first.say(*frames)
+    lab.next_entered()
+    until_queued(server, MOST_INFLIGHT - 1)
+    proxy.flows.clear()  # no answer gets through
+    lab.release(MOST_INFLIGHT)
+    (session,) = server.service._captures.values()
+    until(session._mailbox.is_idle)
+    proxy.cut()
+    second = Wire(server.url)
+    greet(second, resume=welcome.key)
+    second.say(*frames)
+    answered = [second.hear_until(Composite)[-1].frame for _ in frames]
+    assert answered == list(range(MOST_INFLIGHT))
+    assert [entry[1] for entry in lab.log if entry[0] == "frame"] == answered  # each was worked on once
+    second.hang_up()
 
 
 def test_a_client_that_cannot_come_back_says_so(proxy: Proxy) -> None:

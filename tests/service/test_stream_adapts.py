@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from client.commands.stream import Sending
-from protocol.messages import Frame
+from protocol.limits import MOST_INFLIGHT
+from protocol.messages import Composite, Frame
 from protocol.recording import read_messages
 from tests.service.proxy import impaired
 from tests.service.streaming import FakeSource, quietly
@@ -36,3 +37,14 @@ def test_what_is_fixed_stays_as_it_is(server, tmp_path: Path) -> None:
     frames = sent_frames(tmp_path / "r")
     assert {frame.color.width for frame in frames} == {48}
     assert {frame.depth.rounded_per_m for frame in frames} == {0.003}
+
+
+def test_over_a_far_link_more_frames_are_under_way_than_two(server, tmp_path: Path) -> None:
+    with impaired(server.url, delay_s=0.15) as link:
+        summary = quietly(FakeSource(60, fps=20.0), link.url, record=tmp_path / "r")
+    assert summary.answered == summary.sent > 0
+    under_way, most = 0, 0
+    for message in read_messages(tmp_path / "r", print):
+        under_way += isinstance(message, Frame) - isinstance(message, Composite)
+        most = max(most, under_way)
+    assert 2 < most <= MOST_INFLIGHT

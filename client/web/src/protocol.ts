@@ -13,6 +13,8 @@ export const MAX_NAME_CHARS = 64;
 export const MAX_REASON_CHARS = 400;
 export const MAX_SH_BANDS = 6;
 export const MAX_LIGHT_PLACES = 16;
+export const FEW_INFLIGHT = 2;
+export const MOST_INFLIGHT = 8;
 export const VALID_SPREAD_DEG = 25;
 export const MAX_PANORAMA_BYTES = 8388608;
 
@@ -189,6 +191,12 @@ export interface Hello {
   marker?: Marker | null;
   /** How long the session survives a connection that is lost without a bye; 0: not at all. */
   keep_s?: number;
+  /**
+   * Frames that the client would have unanswered at most. The default keeps a server busy that is near.
+   *
+   * More are for a client that is far and sends no frame before its turn: who fills a larger window sees older pictures.
+   */
+  max_inflight?: number;
   /** `welcome.key` of a session to resume. It continues unchanged; all other fields of this message are ignored. */
   resume?: string | null;
 }
@@ -376,7 +384,7 @@ export interface Welcome {
   server: string;
   /** Name of the device that computes. */
   device: string;
-  /** Number of frames that the client may have unanswered. */
+  /** Number of frames that the client may have unanswered; at most as many as it asked for. */
   max_inflight: number;
   /** Secret key to resume the session (`hello.resume`), if the client set `keep_s`. */
   key: string | null;

@@ -54,3 +54,12 @@ test("a frame that has to wait says for how long", () => {
   assert.equal(adaptive.wait_s(1.1, 1, 2), Infinity);
   assert.ok(!adaptive.maySend(1.25, 1, 1) && adaptive.maySend(1.31, 1, 1));
 });
+
+test("over a far link the next frame follows before the first is answered", () => {
+  const adaptive = new Adaptive(1 / 15, 1);
+  adaptive.note({ sent_s: 0, answered_s: 1.1, computed_s: 0.1, bytes_up: 100, bytes_down: 0, waited_s: 0 });
+  assert.equal(adaptive.mostInFlight, 11);
+  assert.ok(Math.abs(adaptive.wait_s(1.1, 1, 1)) < 1e-9);
+  assert.ok(Math.abs(adaptive.wait_s(1.65, 1.6, 4) - 0.05) < 1e-9);
+  assert.equal(adaptive.wait_s(5, 1.6, 11), Infinity);
+});

@@ -69,6 +69,7 @@ LINKS = {
     "loopback": Link(),
     "40 ms and 10 Mbit/s": Link(0.02, 10.0),
     "40 ms and 2 Mbit/s": Link(0.02, 2.0),
+    "200 ms and 20 Mbit/s": Link(0.1, 20.0),
 }
 SENDINGS = {"adaptive": Sending(), "fixed": Sending(adapts=False)}
 if IS_POSSIBLE:

@@ -56,6 +56,7 @@ export class Adaptive {
   private lastComputed_s = 0;
   private computed_s = 0;
   private way_s = 0;
+  private interval_s = 0;
   private transfer_s = 0;
   private bytesUp = 0;
   private bytesDown = 0;
@@ -87,12 +88,19 @@ export class Adaptive {
     return Math.max(this.computed_s, this.transfer_s * greaterShare(this.bytesUp, this.bytesDown));
   }
 
+  /** Frames under way while one is computed and answered, if each is sent in its turn; a late answer is no reason for more. */
+  get mostInFlight(): number {
+    return Math.max(2, Math.ceil((this.way_s + this.busy_s) / Math.max(this.wantedInterval_s, this.busy_s)));
+  }
+
   /** How long a frame sent now would wait for others; Infinity: an answer must come first. */
   wait_s(now_s: number, lastSent_s: number, unanswered: number): number {
     if (unanswered === 0) return 0;
-    if (unanswered > 1) return Infinity;
-    // Processing of the frame in flight began when it was sent, or when the answer before it left the server.
-    const begun_s = Math.max(lastSent_s, this.lastAnswer_s - this.way_s);
+    if (unanswered >= this.mostInFlight) return Infinity;
+    // Processing of the last frame began when it was sent, or when those before it were done, one after another, since the
+    // last answer left the server. Each takes what answers are apart: a turn that others have is not in `busy_s`.
+    const before_s = (unanswered - 1) * Math.max(this.interval_s, this.busy_s);
+    const begun_s = Math.max(lastSent_s, this.lastAnswer_s - this.way_s + before_s);
     return Math.max(this.busy_s - (now_s - begun_s), 0);
   }
 
@@ -107,6 +115,8 @@ export class Adaptive {
     // Time in which the frame before, unanswered when this one was sent, was being processed.
     const waited_s = frame.waited_s ?? Math.min(Math.max(this.lastAnswer_s - sent_s, 0), this.lastComputed_s);
     const way_s = Math.max(answered_s - sent_s - computed_s - waited_s, 0);
+    const interval_s = answered_s - this.lastAnswer_s;
+    if (interval_s < Infinity) this.interval_s += SMOOTHING * (interval_s - this.interval_s);
     [this.lastAnswer_s, this.lastComputed_s] = [answered_s, computed_s];
     this.ways_s.push(way_s);
     if (this.ways_s.length > WINDOW) this.ways_s.shift();

@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 SIDE_PX = 128
 """Pixels of a view's side."""
 VIEWS = 1024
-"""Views besides the one from the dominant light; neighbours are 6 degrees apart."""
+"""Views besides the one from the dominant light; neighbours are 6 degrees apart. Fewer: `Sampling.views`."""
 DISTANCE = 50.0
 """From a view's eye to the volume's centre, in half diagonals: lines of sight are parallel to 1.2 degrees."""
 _SET_STEP = 8  # samples so far apart along an axis have the same directions
@@ -44,11 +44,11 @@ GROWTH = 0.03
 A camera that enters a room sees most of it within a second; light would leak through outdated views."""
 YOUNG_FRAMES = 16
 """A view of a volume of fewer frames is redrawn when the number of frames has doubled: few noisy frames leave holes."""
-MOST_YOUNG = 128
-"""Most of these that one frame redraws: all in 8 frames. With 24 the light of a noisy room's first 12 frames errs by 23
-degrees in the mean instead of 6, with all by 5.6 (GR15FAST; `probeless tune`)."""
-MOST_PER_FRAME = 24
-"""Most views that one frame redraws for growth: all of them in 43 frames while the volume grows."""
+YOUNG_ROUND = 8
+"""Frames in which all views of a young volume are redrawn. In 43 the light of a noisy room's first 12 frames errs by 23
+degrees in the mean instead of 6, with all in each frame by 5.6 (GR15FAST; `probeless tune`)."""
+GROWTH_ROUND = 43
+"""Frames in which all views are redrawn while the volume grows."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ class _Buffers(StageBuffers):
 class ViewsAround:
     """The views of one session and volume. Owned by one thread."""
 
-    def __init__(self, engine: Engine, count: int = VIEWS, per_frame: int | None = None) -> None:
-        """`per_frame`: views that each frame after the first redraws, in turn; more while the volume grows. None:
-        all."""
+    def __init__(self, engine: Engine, count: int = VIEWS, round_frames: int = 1) -> None:
+        """`round_frames`: after the first frame, views are redrawn in turn, all of them in so many frames; in fewer
+        while the volume grows."""
         self.lattice = spherical_fibonacci(count)
         self._engine, self._buffers = engine, _ViewBuffers(engine.workspace)
         scattered = np.argsort(np.arange(count) * GOLDEN_TURN % 1)
@@ -110,7 +110,7 @@ class ViewsAround:
         self._axes = np.zeros((count + 1, 3, 4), np.float32)
         self._axes[:count, :, :3] = view_axes(self.lattice)
         self._light = np.zeros(3)
-        self._per_frame = count if per_frame is None else min(per_frame, count)
+        self._per_frame = -(-count // round_frames)
         self._next: int | None = None
         self._drawn_of = np.zeros((2, count + 1), np.int64)  # bricks and frames, by view
 
@@ -141,8 +141,8 @@ class ViewsAround:
         bricks, frames = self._drawn_of[:, :count]
         has_grown = volume.allocated_bricks > (1 + GROWTH) * bricks
         has_aged = (frames < YOUNG_FRAMES) & (volume.frames >= np.maximum(2 * frames, 1))
-        of_growth = min(int(has_grown.sum()), max(MOST_PER_FRAME - self._per_frame, 0))
-        share = min(self._per_frame + max(of_growth, min(int(has_aged.sum()), MOST_YOUNG)), count)
+        of_growth = min(int(has_grown.sum()), max(-(-count // GROWTH_ROUND) - self._per_frame, 0))
+        share = min(self._per_frame + max(of_growth, min(int(has_aged.sum()), -(-count // YOUNG_ROUND))), count)
         turns = (self._next + np.arange(share)) % (count + bool(self._light.any()))
         self._next = int(turns[-1]) + 1
         return self._order[turns]

@@ -40,9 +40,9 @@ from server.volume.volume import Volume
 
 Floats = NDArray[np.float64]
 
-VIEWS_PER_FRAME = 16
-"""Auxiliary views redrawn in each frame: all of them in 64 frames, as long as places of the world keep their transfer
-at most (transfer_cache.py). In the real kitchen 8 to 96 a frame make pictures that differ by FLIP .0003."""
+ROUND_FRAMES = 64
+"""Frames in which all auxiliary views are redrawn: as long as places of the world keep their transfer at most
+(transfer_cache.py). In the real kitchen rounds of 11 to 128 frames make pictures that differ by FLIP .0003."""
 NEAR_STEPS = 4
 """Samples along a direction in the camera's picture."""
 NEAR_PIXELS = 4.0
@@ -75,13 +75,11 @@ class _Buffers(StageBuffers):
 class ImageSpaceTransfer:
     """One session's image-space transfer and its auxiliary views. Owned by one thread."""
 
-    def __init__(
-        self, engine: Engine, rays: Directions, views: int = VIEWS, views_per_frame: int | None = VIEWS_PER_FRAME
-    ) -> None:
-        """`views_per_frame`: None draws all auxiliary views every frame."""
+    def __init__(self, engine: Engine, rays: Directions, views: int = VIEWS, round_frames: int = ROUND_FRAMES) -> None:
+        """`round_frames`: in which all auxiliary views are redrawn."""
         self._engine = engine
         self._rays = rays
-        self._around = ViewsAround(engine, views, views_per_frame)
+        self._around = ViewsAround(engine, views, round_frames)
         self._cosines, self._nearest = nearest_views(rays, self._around.lattice)
         self._threshold = occlusion_threshold(rays.directions[0, :, :3].astype(np.float64))
         self.depth_views: RealDepthViews | None = None

@@ -65,12 +65,16 @@ PRESETS = {
     "art4": Sampling(stride=4, interleave=4, rays_per_frame=True, adaptive=True),
     "art8": Sampling(stride=8, interleave=4, rays_per_frame=True, adaptive=True),
     "gr15": Sampling(stride=1, image_space=True),
-    "gr15fast": Sampling(stride=4, image_space=True),
+    "gr15fast": Sampling(stride=4, image_space=True, views=384),
 }
 """Thesis 6.1.3.1 and 6.2.3; RM is its GR12, ART4 its GR14. The number is the spacing in pixels. ART traces a fourth of
 its directions in each frame. In the thesis a frame traces a fourth of RM's; here it traces as many as RM, so a sample
 has four times as many: still several times faster, with a light nearer to RM's. Where transfer is kept at places of the
-world, a sample has as many directions, traced at once."""
+world, a sample has as many directions, traced at once.
+
+GR15FAST's views are 10 degrees apart, GR15's 6: of 384 views transfer is 2 % farther from 810 traced rays than of 1024
+(256: 6 %), and the moving lights of E1 are found as well. Drawing the views of a volume that grows is most of its
+transfer's time."""
 
 
 class TransferSampler:

@@ -267,7 +267,7 @@ def test_views_are_drawn_in_turn(engine: Engine) -> None:
     """A round of 7 views, 3 a frame: what the volume has become is seen by all of them after three frames."""
     before, after = (fill_volume(engine, SCENES[n], VOXEL_M) for n in ("ball above a floor", "room open at the top"))
     expected = engine.download(ViewsAround(engine, 7).update(after).depths)[:7]
-    around = ViewsAround(engine, 7, per_frame=3)
+    around = ViewsAround(engine, 7, round_frames=3)
     around.update(before)
     drawn = []
     for _ in range(3):
@@ -279,10 +279,10 @@ def test_views_are_drawn_in_turn(engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("bricks", "frames", "expected"),
     [
-        # of 12, those of 100 or 101 bricks: 12, 7, 2, none
-        ((100, 101, 120, 120, 120, 120, 123, 200), (99,) * 8, [12, 2, 5, 5, 4, 2, 2, 5]),
-        # of one frame: 7 and 2 at 2, the other 3 at 3; of 2 at 4: 7; of 3 and 4 at 30: 7, then the others; not of 16
-        ((100,) * 8, (1, 2, 3, 4, 30, 31, 32, 90), [12, 9, 5, 9, 9, 5, 2, 2]),
+        # of 12, those of 100 or 101 bricks: 12, 8, 4, none
+        ((100, 101, 120, 120, 120, 120, 123, 200), (99,) * 8, [12, 2, 4, 4, 4, 2, 2, 4]),
+        # of one frame: 6 and 2 at 2, the other 4 at 3; of 2 at 4: 6; of 3 and 4 at 30: 6, then the others; not of 16
+        ((100,) * 8, (1, 2, 3, 4, 30, 31, 32, 90), [12, 8, 6, 8, 8, 6, 2, 2]),
     ],
     ids=["more bricks", "more frames"],
 )
@@ -294,12 +294,12 @@ def test_more_views_are_drawn_while_the_volume_grows(
     expected: list[int],
 ) -> None:
     """Those out of date besides those whose turn it is, oldest first, up to the most that a frame draws."""
-    monkeypatch.setattr(auxiliary_views, "MOST_PER_FRAME", 5)
-    monkeypatch.setattr(auxiliary_views, "MOST_YOUNG", 7)
+    monkeypatch.setattr(auxiliary_views, "GROWTH_ROUND", 3)
+    monkeypatch.setattr(auxiliary_views, "YOUNG_ROUND", 2)
     monkeypatch.setattr(auxiliary_views, "draw_views", lambda *args: drawn.append(len(args[-1])))
     volume = fill_volume(engine, SCENES["ball above a floor"], VOXEL_M)
     drawn: list[int] = []
-    around = ViewsAround(engine, 12, per_frame=2)
+    around = ViewsAround(engine, 12, round_frames=6)
     for counts in zip(bricks, frames, strict=True):
         monkeypatch.setattr(Volume, "allocated_bricks", counts[0])
         monkeypatch.setattr(volume, "frames", counts[1])
@@ -311,7 +311,7 @@ def test_the_lights_view_has_its_turn(engine: Engine) -> None:
     before, after = (fill_volume(engine, SCENES[n], VOXEL_M) for n in ("ball above a floor", "room open at the top"))
     toward = unit(np.array([0.2, 0.8, 0.3]))
     expected = engine.download(ViewsAround(engine, 7).update(after, toward).depths)
-    around = ViewsAround(engine, 7, per_frame=3)
+    around = ViewsAround(engine, 7, round_frames=3)
     around.update(before, toward)
     for _ in range(3):  # 3 + 3 + 2 of 7 and the light's
         depths = engine.download(around.update(after, toward).depths)
@@ -320,14 +320,14 @@ def test_the_lights_view_has_its_turn(engine: Engine) -> None:
 
 def test_light_view_is_drawn_when_the_light_turns(engine: Engine) -> None:
     volume = fill_volume(engine, SCENES["ball above a floor"], VOXEL_M)
-    around = ViewsAround(engine, 8, per_frame=1)
+    around = ViewsAround(engine, 8, round_frames=8)
     assert not around.update(volume).has_light_view
     assert not around.update(volume, np.zeros(3)).has_light_view
     for toward in random_directions(3, 5):
         views = around.update(volume, toward)
         np.testing.assert_allclose(views.toward[-1], toward)
         light = engine.download(views.depths)[-1]
-        fresh = ViewsAround(engine, 8, per_frame=1).update(volume, toward)
+        fresh = ViewsAround(engine, 8, round_frames=8).update(volume, toward)
         np.testing.assert_array_equal(light, engine.download(fresh.depths)[-1])
 
 

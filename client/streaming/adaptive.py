@@ -70,8 +70,8 @@ class Adaptive:
         self._rung = 0
         self._network_times: deque[float] = deque(maxlen=WINDOW)
         self._last_answer_s, self._last_computed_s = -math.inf, 0.0
-        self._computed_s = self._network_s = self._interval_s = 0.0
-        self._transfer_s = 0.0
+        self._computed_s = self._network_s = 0.0
+        self._transfer_s = self._turn_s = 0.0
         self._bytes_up = self._bytes_down = 0.0
         self._bad = self._good = 0
         self._patience = GOOD_ANSWERS
@@ -97,9 +97,10 @@ class Adaptive:
 
     @property
     def busy_s(self) -> float:
-        """Duration of the slowest stage. Stages overlap, so their durations do not add."""
+        """Duration of the slowest stage. Stages overlap, so their durations do not add; computing has the turn of
+        others before it."""
         one_way_s = self._transfer_s * _greater_share(self._bytes_up, self._bytes_down)
-        return max(self._computed_s, one_way_s)
+        return max(self._computed_s + self._turn_s, one_way_s)
 
     @property
     def most_in_flight(self) -> int:
@@ -116,9 +117,8 @@ class Adaptive:
         if unanswered >= self.most_in_flight:
             return False
         # The server began the last frame when it was sent, or when those before it were done, one after another, since
-        # the last answer left. Each takes what answers are apart: a turn that others have is not in `busy_s`.
-        before_s = (unanswered - 1) * max(self._interval_s, self.busy_s)
-        begun_s = max(last_sent_s, self._last_answer_s - self._network_s + before_s)
+        # the last answer left.
+        begun_s = max(last_sent_s, self._last_answer_s - self._network_s + (unanswered - 1) * self.busy_s)
         return now_s - begun_s >= self.busy_s
 
     def note(self, frame: AnsweredFrame) -> None:
@@ -127,9 +127,8 @@ class Adaptive:
         if waited_s is None:  # behind the previous frame, if that was unanswered when this one was sent
             waited_s = min(max(self._last_answer_s - frame.sent_s, 0.0), self._last_computed_s)
         network_s = max(frame.answered_s - frame.sent_s - frame.computed_s - waited_s, 0.0)
-        interval_s = frame.answered_s - self._last_answer_s
-        if interval_s < math.inf:
-            self._interval_s += SMOOTHING * (interval_s - self._interval_s)
+        behind_s = max(self._last_answer_s - self._network_s - frame.sent_s, 0.0)  # frames of its own
+        turn_s = max(waited_s - behind_s, 0.0)
         self._last_answer_s, self._last_computed_s = frame.answered_s, frame.computed_s
         self._network_times.append(network_s)
         transfer_s = max(network_s - min(self._delay_s, *self._network_times), 0.0)
@@ -137,6 +136,7 @@ class Adaptive:
         weight = max(SMOOTHING, 1 / self._answers)
         self._network_s += weight * (network_s - self._network_s)
         self._computed_s += weight * (frame.computed_s - self._computed_s)
+        self._turn_s += weight * (turn_s - self._turn_s)
         self._transfer_s += weight * (transfer_s - self._transfer_s)
         self._bytes_up += weight * (frame.bytes_up - self._bytes_up)
         self._bytes_down += weight * (frame.bytes_down - self._bytes_down)

@@ -56,7 +56,7 @@ export class Adaptive {
   private lastComputed_s = 0;
   private computed_s = 0;
   private way_s = 0;
-  private interval_s = 0;
+  private turn_s = 0;
   private transfer_s = 0;
   private bytesUp = 0;
   private bytesDown = 0;
@@ -83,9 +83,12 @@ export class Adaptive {
     return LADDER[this.place]!;
   }
 
-  /** Duration of a frame's slowest stage, where the next one would wait. Stages overlap, so durations do not add up. */
+  /**
+   * Duration of a frame's slowest stage, where the next one would wait. Stages overlap, so durations do not add up; computing
+   * has the turn of others before it.
+   */
   get busy_s(): number {
-    return Math.max(this.computed_s, this.transfer_s * greaterShare(this.bytesUp, this.bytesDown));
+    return Math.max(this.computed_s + this.turn_s, this.transfer_s * greaterShare(this.bytesUp, this.bytesDown));
   }
 
   /** Frames under way while one is computed and answered, if each is sent in its turn; a late answer is no reason for more. */
@@ -98,9 +101,8 @@ export class Adaptive {
     if (unanswered === 0) return 0;
     if (unanswered >= this.mostInFlight) return Infinity;
     // Processing of the last frame began when it was sent, or when those before it were done, one after another, since the
-    // last answer left the server. Each takes what answers are apart: a turn that others have is not in `busy_s`.
-    const before_s = (unanswered - 1) * Math.max(this.interval_s, this.busy_s);
-    const begun_s = Math.max(lastSent_s, this.lastAnswer_s - this.way_s + before_s);
+    // last answer left the server.
+    const begun_s = Math.max(lastSent_s, this.lastAnswer_s - this.way_s + (unanswered - 1) * this.busy_s);
     return Math.max(this.busy_s - (now_s - begun_s), 0);
   }
 
@@ -115,8 +117,8 @@ export class Adaptive {
     // Time in which the frame before, unanswered when this one was sent, was being processed.
     const waited_s = frame.waited_s ?? Math.min(Math.max(this.lastAnswer_s - sent_s, 0), this.lastComputed_s);
     const way_s = Math.max(answered_s - sent_s - computed_s - waited_s, 0);
-    const interval_s = answered_s - this.lastAnswer_s;
-    if (interval_s < Infinity) this.interval_s += SMOOTHING * (interval_s - this.interval_s);
+    const behind_s = Math.max(this.lastAnswer_s - this.way_s - sent_s, 0); // frames of its own
+    const turn_s = Math.max(waited_s - behind_s, 0);
     [this.lastAnswer_s, this.lastComputed_s] = [answered_s, computed_s];
     this.ways_s.push(way_s);
     if (this.ways_s.length > WINDOW) this.ways_s.shift();
@@ -124,6 +126,7 @@ export class Adaptive {
     const weight = Math.max(SMOOTHING, 1 / ++this.told);
     this.way_s += weight * (way_s - this.way_s);
     this.computed_s += weight * (computed_s - this.computed_s);
+    this.turn_s += weight * (turn_s - this.turn_s);
     this.transfer_s += weight * (transfer_s - this.transfer_s);
     this.bytesUp += weight * (bytes_up - this.bytesUp);
     this.bytesDown += weight * (bytes_down - this.bytesDown);

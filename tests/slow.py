@@ -42,8 +42,9 @@ def file_of(name: str) -> str:
 
 
 def without_device(node_id: str, device: str) -> str:
-    """Name of a test without the parameter that is the device, which stands first."""
-    return node_id.replace(f"[{device}]", "").replace(f"[{device}-", "[")
+    """Name of a test without the parameter that is the device, wherever it stands."""
+    shorter = node_id.replace(f"[{device}]", "").replace(f"[{device}-", "[")
+    return shorter.replace(f"-{device}]", "]").replace(f"-{device}-", "-")
 
 
 def stale_lines(lines: Iterable[str], collected: Collection[str]) -> list[str]:

@@ -39,11 +39,18 @@ def test_set_up_and_tear_down_count() -> None:
     assert read_durations("\n".join(lines)) == {"tests/a.py::test_x[a b]": 1.75}
 
 
-@pytest.mark.parametrize("rest", ["", "[size0-True]"])
-def test_the_device_is_no_part_of_a_name(rest: str) -> None:
+@pytest.mark.parametrize(
+    ("whole", "rest"),
+    [
+        ("[{}]", ""),
+        ("[{}-size0-True]", "[size0-True]"),
+        ("[size0-{}]", "[size0]"),
+        ("[size0-{}-True]", "[size0-True]"),
+    ],
+)
+def test_the_device_is_no_part_of_a_name(whole: str, rest: str) -> None:
     device = "Some / pthread-Device 9-V"
-    with_device = rest.replace("[", f"[{device}-") or f"[{device}]"
-    assert without_device(f"tests/a.py::test_x{with_device}", device) == f"tests/a.py::test_x{rest}"
+    assert without_device(f"tests/a.py::test_x{whole.format(device)}", device) == f"tests/a.py::test_x{rest}"
 
 
 def test_lines_that_name_no_test_are_found() -> None:

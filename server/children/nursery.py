@@ -15,6 +15,10 @@ from dataclasses import dataclass
 from server.children.child import NUMBER, READY
 
 LOADING_TIMEOUT_S = 60.0
+KEPT = ("PATH", "LD_LIBRARY_PATH", "LANG", "TMPDIR")
+"""Variables of the environment that children have too."""
+KEPT_PREFIXES = ("OPENBLAS_", "NPY_")
+"""Which kernels of a processor OpenBLAS and NumPy use: a child's results are this process's to the bit."""
 
 
 class ChildDied(Exception):
@@ -130,7 +134,7 @@ class Nursery:
 
 def _environment() -> dict[str, str]:
     """Minimal environment for the children, without secrets such as the token."""
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH", "LANG", "TMPDIR") if name in os.environ}
+    kept = {name: value for name, value in os.environ.items() if name in KEPT or name.startswith(KEPT_PREFIXES)}
     threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
     # Keep freed image memory in the process: allocating it again from the system takes as long as decoding.
     memory = {"MALLOC_MMAP_THRESHOLD_": str(64 << 20), "MALLOC_TRIM_THRESHOLD_": str(128 << 20)}

@@ -40,7 +40,9 @@ class VideoDecoder:
             raise ProtocolError(f"color.data cannot be decoded as h264: {error.strerror}") from error
         if len(pictures) != 1 or pictures[0].format.name not in ("yuv420p", "yuvj420p"):
             raise ProtocolError("color.data cannot be decoded as h264: it is not one picture of 4:2:0")
-        return np.asarray(pictures[0].to_ndarray(format="rgb24", **self._color_of(pictures[0])), np.uint8)
+        # One thread, as of the decoder: the server's readers may start none.
+        converted = pictures[0].reformat(format="rgb24", threads=1, **self._color_of(pictures[0]))
+        return np.asarray(converted.to_ndarray(), np.uint8)
 
     def _color_of(self, picture: Any) -> dict[str, Any]:
         """Set colour matrix and range to those of the stream; the default is that of JPEG."""

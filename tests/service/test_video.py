@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -176,6 +178,23 @@ def test_readers_start_no_threads_and_have_limits(parsers: Parsers) -> None:
     assert str(VIDEO_JOB.memory_mib << 20) in limits
     reader.close()
     assert not parsers._videos
+
+
+def test_no_thread_is_needed_to_read_a_picture() -> None:
+    """Where none can be started: for any user but root, who is no subject of the limit, a reader would die of it."""
+    program = """
+import os
+from protocol.video import VideoDecoder
+from server.children.child import limit
+from tests.service.test_video import messages
+decoder, message = VideoDecoder(), messages(1)[0]
+if os.getuid() == 0:
+    os.setuid(65534)
+limit(1024)
+print(decoder.decode(message.color.data).shape)
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout.split()[:1]) == (0, ["(32,"]), run.stderr[-500:]
 
 
 def test_a_reader_and_this_process_read_the_same(parsers: Parsers) -> None:

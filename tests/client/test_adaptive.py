@@ -202,6 +202,15 @@ def test_a_far_device_that_others_use_gets_no_queue_of_frames() -> None:
     assert len(done) > 0.9 * 30 / (link.turn_s + link.computed_s)
 
 
+def test_frames_that_wait_at_a_far_server_grown_slower_become_fewer() -> None:
+    adaptive, link = Adaptive(1 / FPS, delay_s=0.4), Link(100e6 / 8, delay_s=0.2, says_wait=True)
+    stream(adaptive, link, 10)
+    link.computed_s = 0.3
+    stream(adaptive, link, 10, start_s=10)
+    assert max(link.ages_s) > 1.3  # frames that were under way when it began
+    assert median(link.ages_s[-10:]) < 2 * link.delay_s + link.computed_s + 0.05
+
+
 def test_throughput_is_told() -> None:
     adaptive, link = Adaptive(1 / FPS, delay_s=0.04), Link(8e6 / 8)
     assert adaptive.bytes_per_s is None

@@ -128,7 +128,7 @@ class Adaptive:
             waited_s = min(max(self._last_answer_s - frame.sent_s, 0.0), self._last_computed_s)
         network_s = max(frame.answered_s - frame.sent_s - frame.computed_s - waited_s, 0.0)
         behind_s = max(self._last_answer_s - self._network_s - frame.sent_s, 0.0)  # frames of its own
-        turn_s = max(waited_s - behind_s, 0.0)
+        turn_s = 0.0 if frame.waited_s is None else max(frame.waited_s - behind_s, 0.0)
         self._last_answer_s, self._last_computed_s = frame.answered_s, frame.computed_s
         self._network_times.append(network_s)
         transfer_s = max(network_s - min(self._delay_s, *self._network_times), 0.0)

@@ -174,6 +174,14 @@ def test_a_slow_server_is_no_reason_for_worse_pictures() -> None:
     assert median(link.ages_s[-20:]) < 0.3 + 0.04 + 0.1 + 0.3 * 0.5
 
 
+def test_a_wait_that_is_not_told_is_not_taken_for_the_turn_of_others() -> None:
+    untold, told = (
+        stream(Adaptive(1 / FPS, delay_s=0.04), Link(10e6 / 8, computed_s=0.15, says_wait=says), 40)
+        for says in (False, True)
+    )
+    assert len(untold) > 0.7 * len(told)
+
+
 def test_frames_do_not_queue_at_a_server_that_takes_longer_than_it_says() -> None:
     adaptive, link = Adaptive(1 / FPS, delay_s=0.04), Link(100e6 / 8, computed_s=0.3)
     link.overhead_s = 0.04  # of decoding and the like, not part of what it tells

@@ -118,7 +118,7 @@ export class Adaptive {
     const waited_s = frame.waited_s ?? Math.min(Math.max(this.lastAnswer_s - sent_s, 0), this.lastComputed_s);
     const way_s = Math.max(answered_s - sent_s - computed_s - waited_s, 0);
     const behind_s = Math.max(this.lastAnswer_s - this.way_s - sent_s, 0); // frames of its own
-    const turn_s = Math.max(waited_s - behind_s, 0);
+    const turn_s = frame.waited_s === null ? 0 : Math.max(frame.waited_s - behind_s, 0);
     [this.lastAnswer_s, this.lastComputed_s] = [answered_s, computed_s];
     this.ways_s.push(way_s);
     if (this.ways_s.length > WINDOW) this.ways_s.shift();

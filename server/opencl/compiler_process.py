@@ -15,6 +15,9 @@ from server.opencl.compiling import DONE, NICENESS, Launch
 from server.opencl.device import Device, open_device
 from server.opencl.program import KernelBuildError
 
+LARGEST_TYPE = 128
+"""Bytes of `long16`, by which OpenCL aligns memory (specification of OpenCL 1.2, 5.2.1 and 6.1.5)."""
+
 
 def main() -> None:
     """The process: `DEVICE IDLE_S`; requests come as lines of JSON, each is answered by a line."""
@@ -40,16 +43,21 @@ def _do(device: Device, request: dict[str, Any]) -> None:
         return
     launch = Launch(**request["launch"])
     kernel, queue = cl.Kernel(program, launch.kernel), cl.CommandQueue(device.context)
-    arguments = [bytes.fromhex(one) if isinstance(one, str) else _zeros(queue, one) for one in launch.arguments]
+    arguments = [bytes.fromhex(one) if isinstance(one, str) else zeros(device.context, one) for one in launch.arguments]
     kernel.set_args(*arguments)  # which keeps none of them alive
     offset = None if launch.offset is None else tuple(launch.offset)
     cl.enqueue_nd_range_kernel(queue, kernel, tuple(launch.size), tuple(launch.local), offset)
     queue.finish()
 
 
-def _zeros(queue: cl.CommandQueue, size: int | None) -> cl.Buffer | None:
-    """Memory that is all zeros; what no kernel touches takes none of the machine's."""
+def zeros(context: cl.Context, size: int | None) -> cl.Buffer | None:
+    """Memory of `size` bytes that is all zeros; what no kernel touches takes none of the machine's. None: no memory.
+
+    It is aligned as memory that PoCL allocates is: kernels are compiled to rely on it, and crash where it is not.
+    """
     if size is None:
         return None
+    host = np.zeros(size + LARGEST_TYPE, np.uint8)
+    start = -host.ctypes.data % LARGEST_TYPE
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
-    return cl.Buffer(queue.context, flags, hostbuf=np.zeros(size, np.uint8))
+    return cl.Buffer(context, flags, hostbuf=host[start : start + size])

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
+from server.opencl.compiler_process import zeros
 from server.opencl.compiling import SMALL_GRID, KernelCompiler, Launch
-from server.opencl.device import list_devices
+from server.opencl.device import Device, list_devices
 from server.opencl.engine import Engine
 
 LAUNCH = Launch("kernel", (64,), (64,), None, ("01000000", 256))
@@ -195,3 +197,15 @@ def test_an_engine_has_programs_and_first_launches_compiled_while_others_have_th
         engine.launch(engine.kernel("voxelize.cl", "clear_cells", SLAB=7), (100,), 100, *arrays)
     assert recorder.asked == [("voxelize.cl", None, True), ("voxelize.cl", "clear_cells", True)]
     engine.pacer.yielding = None
+
+
+def test_memory_of_the_compiling_process_is_aligned_and_zero(device: Device) -> None:
+    queue = cl.CommandQueue(device.context)
+    for size in (1, 16, 100, 1000, 4096, 76_800, 100_000, 1_000_000):
+        memory = zeros(device.context, size)
+        assert memory is not None
+        host, _ = cl.enqueue_map_buffer(queue, memory, cl.map_flags.READ, 0, (size,), np.uint8)
+        assert host.ctypes.data % 128 == 0, size
+        assert not host.any(), size
+        host.base.release(queue)
+    assert zeros(device.context, None) is None

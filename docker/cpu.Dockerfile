@@ -12,7 +12,8 @@ COPY docker docker
 COPY protocol protocol
 COPY server server
 RUN sh docker/install.sh program
-ENV HOME=/data PYTHONUNBUFFERED=1
+# Memory in pages of 2 MB, which kernels miss less often in the processor's tables: frames take 3 % less (docs/operating.md).
+ENV HOME=/data PYTHONUNBUFFERED=1 GLIBC_TUNABLES=glibc.malloc.hugetlb=1
 VOLUME /data
 USER 10001:10001
 EXPOSE 8080

@@ -7,7 +7,7 @@ import { reasonOf } from "./capture/source";
 import { CaptureStream, type Times } from "./capture/stream";
 import { Connection } from "./connection";
 import { closeParts, decodeLayer, transferOf } from "./local/layer_parts";
-import { type Composite, type Layer, type LayerPatch, MOST_INFLIGHT, type ServerMessage } from "./protocol";
+import { type Composite, type Layer, type LayerPatch, type ServerMessage } from "./protocol";
 import type { FromWorker, News, ToWorker } from "./worker_messages";
 
 /** Quality is reduced until the link carries this frame interval, or the rate that the server computes. */
@@ -71,8 +71,7 @@ function beginStream({ url, setup, video, adapts }: Extract<ToWorker, { kind: "c
   if (pace !== null) void measureDelay_s(url).then((delay_s) => (pace.delay_s = delay_s));
   const frames = new FrameEncoder(video, say, () => pace?.coding ?? LADDER[0]!, (sending) => post({ kind: "sending", sending }));
   encoder = frames;
-  const greeting = pace === null ? setup : { ...setup, max_inflight: MOST_INFLIGHT };
-  stream = new CaptureStream(url, greeting, (frame) => frames.encode(frame), {
+  stream = new CaptureStream(url, setup, (frame) => frames.encode(frame), {
     onWanted: () => post({ kind: "wanted" }),
     onState: (state) => post({ kind: "state", state }),
     onMessage: (message, times) => {

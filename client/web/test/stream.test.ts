@@ -184,6 +184,15 @@ test("with a pace a frame is asked for when the one before it is past the slowes
   stream.stop("");
 });
 
+test("with a pace as many frames as a server allows are asked for, without one no more than it gives unasked", async () => {
+  for (const [pace, wanted] of [[new Adaptive(1 / 15), 8], [null, undefined]] as const) {
+    const { stream } = await opened({}, pace ?? undefined);
+    const hello = FakeSocket.last.sent[0]!;
+    assert.ok(hello.type === "hello" && hello.max_inflight === wanted);
+    stream.stop("");
+  }
+});
+
 test("a frame is asked for so early that it is encoded when the one before it is done", async (context) => {
   context.mock.timers.enable({ apis: ["setTimeout"] });
   let now_ms = 0;

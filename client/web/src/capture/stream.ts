@@ -2,7 +2,7 @@
 // after a lost connection (protocol/README.md).
 
 import { CAPTURING, Connection, type ConnectionState, REFUSED_CAPTURE } from "../connection";
-import type { CameraModel, Composite, Frame, Layer, Light, ServerMessage } from "../protocol";
+import { type CameraModel, type Composite, type Frame, type Layer, type Light, MOST_INFLIGHT, type ServerMessage } from "../protocol";
 import type { Request, Setup } from "../session";
 import { type Adaptive, SMOOTHING } from "./adaptive";
 import { isSameCamera } from "./axes";
@@ -44,6 +44,8 @@ export class CaptureStream {
   private encoding_ms = 0;
   private timer: ReturnType<typeof setTimeout> | undefined;
   private readonly requests = new Map<number, Request>();
+  /** With a pace, how many are under way is its matter. */
+  private readonly asked: Partial<Setup>;
   /** Number of the connection: work begun on an earlier one is not sent on this one. */
   private epoch = 0;
 
@@ -57,7 +59,9 @@ export class CaptureStream {
     private readonly encodeFrame: (frame: Numbered) => Promise<Frame>,
     private readonly hooks: StreamHooks,
     private readonly pace: Adaptive | null = null,
-  ) {}
+  ) {
+    this.asked = pace === null ? {} : { max_inflight: MOST_INFLIGHT };
+  }
 
   /** Start with a camera; if it is not known yet, the first frame defines it and is not sent. */
   start(camera: CameraModel | null = null): void {
@@ -116,7 +120,7 @@ export class CaptureStream {
     this.connection = new Connection(
       this.url,
       {
-        greeting: () => ({ type: "hello", ...this.setup, camera, resume: this.key }),
+        greeting: () => ({ type: "hello", ...this.setup, ...this.asked, camera, resume: this.key }),
         onState: (state) => this.hooks.onState(state),
         onMessage: (message) => this.receive(message),
         onClosed: (code) => {

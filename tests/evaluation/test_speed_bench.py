@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -14,6 +15,8 @@ from protocol.messages import TIMING_ROWS
 from server.opencl.device import Device, open_device
 from tests.bench.speed import devices
 from tests.bench.speed.frames import DEFAULT, EMPTY, FAST, WARM_UP, WITHOUT, Stage, measure_moving, measure_rest
+from tests.bench.speed.memory import measure_memory
+from tests.bench.truth.rooms import CAMERA
 
 
 class BackAndForth(GallerySource):
@@ -76,3 +79,17 @@ def test_devices_are_measured_side_by_side(device: Device, tmp_path: Path, monke
         assert rows[f"{name}: kernels, sum of medians"] > 0
         assert 0 < rows[f"{name}: host's own time, median"] < rows[f"{name}: frame, median"]
     assert 0.1 < rows[f"raycast: {device.name} over another"] < 10
+
+
+def test_what_is_kept_is_counted_and_does_not_grow(device: Device, tmp_path: Path) -> None:
+    small = msgspec.structs.replace(CAMERA, width=80, height=60, fx=66.0, fy=66.0, cx=39.5, cy=29.5)
+    small_stage(tmp_path)
+    said: list[str] = []
+    part = measure_memory(device, tmp_path / "ball.glb", 15, said.append, small, voxel_m=0.05)
+    rows = {row.name.removeprefix("room of 6x3x6 m: "): row.value for row in part.rows}
+    samples = 80 * 60 / 16
+    entries = 4 * samples * 232 / 1e6  # of transfer alone, before the table is rounded up
+    assert entries < rows["what is kept at places of the world, at the end"] < 6 * entries
+    assert rows["growth of it, after a fifth of the walk"] == 0
+    assert rows["all on the device, at the end"] > rows["what is kept at places of the world, at the end"]
+    assert said == ["memory: frame 0 of 15"]

@@ -16,6 +16,7 @@ from tests.bench.report.report import Report
 from tests.bench.report.run import Run, data_folder, data_source
 from tests.bench.speed.devices import measure_devices
 from tests.bench.speed.frames import Stage, measure_moving, measure_rest
+from tests.bench.speed.memory import measure_memory
 
 OUT = ROOT / "out" / "bench" / "speed"
 KITCHEN = "rgbd_7scenes_redkitchen"
@@ -30,7 +31,8 @@ def run_suite(quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
     OUT.mkdir(parents=True, exist_ok=True)
     finished = Finished(OUT, run.device.name, quick)
     report = Report(run.device.name)
-    for name, measure in {"moving camera": _moving, "camera at rest": _rest, "devices": _devices}.items():
+    parts = {"moving camera": _moving, "camera at rest": _rest, "memory": _memory, "devices": _devices}
+    for name, measure in parts.items():
         part = finished.part(name, lambda measure=measure: measure(run), say)  # type: ignore[misc]
         report.rows += part.rows
         report.unmeasured += part.unmeasured
@@ -52,6 +54,10 @@ def _moving(run: Run) -> Part:
 
 def _rest(run: Run) -> Part:
     return measure_rest(run.device, kitchen_stage(), 100, run.of(72, 120), run.say)
+
+
+def _memory(run: Run) -> Part:
+    return measure_memory(run.device, data_folder(OBJECT), run.of(40, 1000), run.say)
 
 
 def _devices(run: Run) -> Part:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -35,8 +36,9 @@ def measure_memory(
     for index, pose in enumerate(walk(frames)):
         if index % 50 == 0:
             say(f"memory: frame {index} of {frames}")
+        frame = LIVING_ROOM.frame(index, camera, pose)
         for session in (with_caches, without):
-            session.process(LIVING_ROOM.frame(index, camera, pose))
+            session.process(replace(frame))
         kept_mb.append((with_caches.device_bytes - without.device_bytes) / 1e6)
     part = Part(sizes={"frames of a walk through a room": frames})
     name = "room of 6x3x6 m"

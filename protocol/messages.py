@@ -574,6 +574,8 @@ class Timings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Times that the host waited for memory of the device."""
     read_bytes: int = 0
     """Bytes of those reads."""
+    copies: int = 0
+    """Copies of memory to, from and on the device, waited for or not."""
 
 
 TIMING_ROWS = (

@@ -138,6 +138,7 @@ class Pipeline:
         is_learning = self._settings.plan == "everything" or not room.light.is_given
         with stage("light_estimation"):  # 5.1.3
             self.light.begin(context, is_learnt=is_learning and frame.has_depth and reuse.reason is None)
+            engine.send_reads()  # the light's are needed before the device has drawn
         with stage("radiance_transfer"):  # 5.1.2, eq. 5.2; 7.3.3
             needs_transfer = is_shaded or room.light.needs_transfer or self._settings.plan == "everything"
             samples, is_kept = self._sample_transfer(context, reuse, is_shaded, needs_transfer)
@@ -301,6 +302,7 @@ class Pipeline:
     ) -> FrameResult:
         """The answer, once the device is done."""
         picture, plan = rendered.picture(), rendered.told_plan()
+        self._engine.send_reads()
         self._engine.finish()
         timings = self._timings()
         self._frames += 1
@@ -320,9 +322,9 @@ class Pipeline:
 
     def _timings(self) -> Timings:
         profile = self._engine.profile
-        launches, reads, read_bytes = profile.launches, profile.reads, profile.read_bytes
+        counted = Timings(
+            launches=profile.launches, reads=profile.reads, read_bytes=profile.read_bytes, copies=profile.copies
+        )
         times = profile.collect()
         self.kernel_ms = times.kernels
-        return Timings(
-            **times.rows, total=times.total, host=times.idle, launches=launches, reads=reads, read_bytes=read_bytes
-        )
+        return structs.replace(counted, **times.rows, total=times.total, host=times.idle)

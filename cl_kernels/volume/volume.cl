@@ -148,7 +148,7 @@ kernel void find_near_solid(const int count, global const int *listed, const int
     near[item] = any != 0;
 }
 
-// Corners of the box around the bricks that have become solid or empty, in bricks; low > high = none.
+// Corners of the box around the bricks that have become solid or empty, in bricks. The low one is negated, so that one value fills all six.
 #define CHANGED_LOW 0
 #define CHANGED_HIGH 3
 
@@ -232,9 +232,9 @@ kernel void gaps_in_slices(const int4 bricks, global const ulong *solid, const i
     barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
     if (z >= bricks.z || box[2] < 0) return;
     if (item == 0) {
-        atomic_min(changed + CHANGED_LOW, box[0]);
-        atomic_min(changed + CHANGED_LOW + 1, box[1]);
-        atomic_min(changed + CHANGED_LOW + 2, z);
+        atomic_max(changed + CHANGED_LOW, -box[0]);
+        atomic_max(changed + CHANGED_LOW + 1, -box[1]);
+        atomic_max(changed + CHANGED_LOW + 2, -z);
         atomic_max(changed + CHANGED_HIGH, box[2]);
         atomic_max(changed + CHANGED_HIGH + 1, box[3]);
         atomic_max(changed + CHANGED_HIGH + 2, z);
@@ -254,8 +254,8 @@ kernel void gaps_along_z(const int4 bricks, global const uchar *along_y, const i
     const int z = get_global_id(2) % bricks.z;
     const int variant = get_global_id(2) / bricks.z;
     if (16 * get_global_id(0) >= bricks.x || y >= bricks.y || variant >= 2 * SLICE_VARIANTS) return;
-    if (x + 15 < changed[CHANGED_LOW] - limit || x > changed[CHANGED_HIGH] + limit) return;
-    if (y < changed[CHANGED_LOW + 1] - limit || y > changed[CHANGED_HIGH + 1] + limit) return;
-    if (z < changed[CHANGED_LOW + 2] - limit || z > changed[CHANGED_HIGH + 2] + limit) return;
+    if (x + 15 < -changed[CHANGED_LOW] - limit || x > changed[CHANGED_HIGH] + limit) return;
+    if (y < -changed[CHANGED_LOW + 1] - limit || y > changed[CHANGED_HIGH + 1] + limit) return;
+    if (z < -changed[CHANGED_LOW + 2] - limit || z > changed[CHANGED_HIGH + 2] + limit) return;
     add_axis(bricks, x, y, z, variant, SLICE_VARIANTS, 2, limit, along_y, gap);
 }

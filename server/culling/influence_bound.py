@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.objects.rasterize import Placed
-from server.opencl.buffers import BufferDescription, KeyedBufferDescription, StageBuffers
+from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
 from server.opencl.pending_read import PendingRead
 from server.shading.traced_scene import DeviceLight, ball_around, light_arguments
@@ -124,14 +124,10 @@ def bound_influence(
 
 
 class _Buffers(StageBuffers):
-    sample_bounds = KeyedBufferDescription(cl_types.float4)
-    """[rows, cols] bounds at every n-th sample, by n."""
     balls = BufferDescription(cl_types.float4)
     """[n] of balls_around."""
     discs = BufferDescription(cl_types.float4)
     """[n] direction and half angle (rad) of each disc of the light."""
-    greatest = BufferDescription(cl_types.float4)
-    """[h, chunks] the greatest bounds of a chunk of pixels."""
 
 
 def balls_around(objects: Sequence[Placed]) -> NDArray[np.float32]:
@@ -163,7 +159,7 @@ def _bound_samples(
     """[rows, cols] float4, see influence_bound.cl."""
     buffers = engine.buffers(_Buffers)
     cols, rows = -(-transfer.cols // every), -(-transfer.rows // every)
-    bounds = buffers.sample_bounds[every].array((rows, cols))
+    bounds = engine.array_to_read((rows, cols), cl_types.float4)
     engine.launch(
         engine.kernel("influence_bound.cl", "bound_samples", **_defines(engine, light, transfer)),
         (cols, rows),
@@ -203,7 +199,7 @@ def _bound_pixels(
         or [(0, 0, 1, 0)],
         np.float32,
     )
-    most = buffers.greatest.array((camera.height, chunks))
+    most = engine.array_to_read((camera.height, chunks), cl_types.float4)
     defines = _defines(engine, light, transfer) | ({"BICUBIC": 1} if upsampling == "bicubic" else {})
     engine.launch(
         engine.kernel("influence_bound.cl", "bound_pixels", **defines),

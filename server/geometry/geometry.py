@@ -164,12 +164,18 @@ class Geometry:
 
 
 def check_size(camera: CameraModel, frame: RgbdFrame) -> None:
-    """Raises ValueError, one line, for images that do not have the camera's size."""
+    """Raises ValueError, one line, for images that do not have the camera's size and types."""
     depth = camera.depth_lens
     if frame.color.shape != (camera.height, camera.width, 3) or frame.depth.shape != (depth.height, depth.width):
         raise ValueError(
             f"colour is {frame.color.shape[1]}x{frame.color.shape[0]}, depth {frame.depth.shape[1]}x"
             f"{frame.depth.shape[0]}; the camera has {camera.width}x{camera.height} and {depth.width}x{depth.height}"
+        )
+    color_type = "uint16" if camera.color_encoding == "linear16" else "uint8"
+    if frame.color.dtype != color_type or frame.depth.dtype != "uint16":
+        raise ValueError(
+            f"colour is of type {frame.color.dtype}, depth of {frame.depth.dtype}; "
+            f"{camera.color_encoding} is {color_type}, depth uint16 in units of depth_scale_m"
         )
 
 

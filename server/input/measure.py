@@ -23,14 +23,10 @@ GREATEST_DEPTH_M = 10.0
 
 
 class _Buffers(StageBuffers):
-    srgb8_codes = BufferDescription(np.uint8)
-    """[h, w, 3] colour as received."""
-    linear16_codes = BufferDescription(np.uint16)
-    """[h, w, 3] colour as received."""
+    received = BufferDescription(np.uint8)
+    """Colour [h, w, 3] and depth [h, w] as received."""
     linear_values = BufferDescription(np.float32)
     """[256 or 65536] radiance of each code value."""
-    depth_units = BufferDescription(np.uint16)
-    """[h, w] depth as received."""
     radiance = BufferDescription(cl_types.float4)
     depth_m = BufferDescription(np.float32)
 
@@ -65,8 +61,8 @@ def measure(engine: Engine, camera: CameraModel, frame: RgbdFrame) -> Measuremen
     """Upload `frame` and rectify it. Its pictures must have the sizes of the camera's lenses."""
     buffers, shape = engine.buffers(_Buffers), (camera.height, camera.width)
     is_linear, one_lens = camera.color_encoding == "linear16", camera.depth is None
-    codes = (buffers.linear16_codes if is_linear else buffers.srgb8_codes).upload(frame.color)
-    units = buffers.depth_units.upload(frame.depth)
+    received = buffers.received.upload_parts({"color": frame.color, "depth": frame.depth})
+    codes, units = received.array("color"), received.array("depth")
     radiance = buffers.radiance.array(shape)
     depth_m = buffers.depth_m.array(shape) if one_lens else register_depth(engine, camera, units, GREATEST_DEPTH_M)
     engine.launch(

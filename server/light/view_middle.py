@@ -6,7 +6,6 @@ import numpy as np
 import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
-from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.volume.raycast import Surface
 
@@ -17,18 +16,13 @@ SHARE = 0.9
 way in front of it is free."""
 
 
-class _Buffers(StageBuffers):
-    sums = BufferDescription(cl_types.float4)
-    """[rows] positions summed along a row, and their number."""
-
-
 class ViewMiddle:
     """Of one picture; begun when this is made."""
 
     def __init__(self, engine: Engine, surface: Surface) -> None:
         height, width = surface.positions.shape
         rows = len(range(STEP_PX // 2, height, STEP_PX))
-        sums = engine.buffers(_Buffers).sums.array((rows,))
+        sums = engine.array_to_read((rows,), cl_types.float4)
         kernel = engine.kernel("view_middle.cl", "sum_positions")
         engine.launch(kernel, (rows,), width, rows, STEP_PX, surface.positions, sums)
         self._sums = engine.begin_download(sums)

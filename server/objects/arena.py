@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from server.objects.virtual_object import VirtualObject
 from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
 from server.opencl.engine import Engine
-from server.opencl.transfer import copy_into
 from server.scene.mipmaps import CHANNEL_VALUES
 
 
@@ -113,7 +112,7 @@ def _joined(engine: Engine, buffer: DeviceBuffer, parts: list[cl_array.Array], t
     whole = buffer.array((max(sum(map(len, parts)), 1), *tail))
     start = 0
     for part in parts:
-        copy_into(engine.queue, whole, start, part)
+        engine.copy_into(whole, start, part)
         start += part.nbytes
     return whole
 

@@ -16,7 +16,6 @@ from server.objects.virtual_object import VirtualObject
 from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.opencl.parts import Parts
-from server.opencl.transfer import copy_into
 
 Matrix = NDArray[np.float64]
 
@@ -97,6 +96,6 @@ def _gather_distances(engine: Engine, grids: list[cl_array.Array]) -> tuple[cl_a
     before, pool = buffer.current, buffer.array((max(total, 1),))
     if pool is not before or [*map(id, pooled.grids)] != [*map(id, unique)]:
         for grid in unique:
-            copy_into(engine.queue, pool, 4 * starts[id(grid)], grid)
+            engine.copy_into(pool, 4 * starts[id(grid)], grid)
         pooled.grids = unique
     return pool, starts

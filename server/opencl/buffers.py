@@ -13,6 +13,7 @@ import pyopencl.array as cl_array
 from numpy.typing import DTypeLike, NDArray
 
 from server.opencl.parts import Parts, pack, part_alignment_bytes, place
+from server.opencl.profile import Profile
 
 Group = TypeVar("Group", bound="StageBuffers")
 
@@ -70,6 +71,13 @@ class DeviceBuffer:
         """Several arrays in this buffer, which must be of uint8; contents are kept as in `array`."""
         starts, size = place(shapes, part_alignment_bytes(self._workspace.queue.device))
         return Parts(self.array((size,)), starts, shapes)
+
+    def upload_parts(self, arrays: Mapping[str, NDArray[Any]]) -> Parts:
+        """Copy `arrays` into this buffer, which must be of uint8, at once; the caller may change them."""
+        shapes = {part: (values.shape, values.dtype) for part, values in arrays.items()}
+        parts = self.parts(shapes)
+        self._workspace.send(parts.memory, pack(arrays, parts.starts, parts.memory.nbytes))
+        return parts
 
     def refresh_parts(self, arrays: Mapping[str, NDArray[Any]]) -> Parts:
         """Copy `arrays` into this buffer, which must be of uint8, as `refresh` does."""
@@ -142,8 +150,9 @@ class StageBuffers:
 class Workspace:
     """All buffers of one engine: counts them, copies to them and releases them."""
 
-    def __init__(self, queue: cl.CommandQueue) -> None:
+    def __init__(self, queue: cl.CommandQueue, profile: Profile) -> None:
         self.queue: cl.CommandQueue = queue
+        self._profile = profile
         self._buffers: list[ref[DeviceBuffer]] = []
         self._named: dict[tuple[str, np.dtype[Any]], DeviceBuffer] = {}
         self._copying: deque[tuple[cl.Event, NDArray[Any]]] = deque()
@@ -155,8 +164,13 @@ class Workspace:
     def copy(self, array: cl_array.Array, values: NDArray[Any]) -> None:
         """Copy `values` over the beginning of an array. Waits for nothing: a copy of them is kept until it is done."""
         if values.nbytes:
-            memory, copied = cast(Any, array.data), np.array(values, order="C")
-            self._copying.append((cl.enqueue_copy(self.queue, memory, copied, is_blocking=False), copied))
+            self.send(array, np.array(values, order="C"))
+
+    def send(self, array: cl_array.Array, values: NDArray[Any]) -> None:
+        """As `copy`, of contiguous values that nobody changes from now on: no copy of them is made."""
+        self._profile.copies += 1
+        memory = cast(Any, array.data)
+        self._copying.append((cl.enqueue_copy(self.queue, memory, values, is_blocking=False), values))
         while self._copying and self._copying[0][0].command_execution_status == cl.command_execution_status.COMPLETE:
             self._copying.popleft()
 

@@ -11,7 +11,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cl_array
 import pyopencl.cltypes as cl_types
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from server.opencl.buffers import BufferDescription, Group, StageBuffers, Workspace
 from server.opencl.compiling import SMALL_GRID, Launch
@@ -20,6 +20,7 @@ from server.opencl.pacing import Pacer, Size
 from server.opencl.pending_read import PendingRead
 from server.opencl.profile import Profile
 from server.opencl.program import Define
+from server.opencl.read_page import ReadPage
 
 State = TypeVar("State")
 _FLOATS, _INTS, _TWO_INTS = (struct.Struct(of) for of in ("<4f", "<4i", "<2i"))
@@ -34,14 +35,17 @@ class Engine:
     """One command queue with everything that belongs to it. Owned by one thread at a time."""
 
     def __init__(self, device: Device, beside: Engine | None = None, *, has_own_queue: bool = False) -> None:
-        """`beside`: another engine, whose queue, kernels and times this one shares; its memory is its own. What either
-        does, it does after all that both were asked for before; `has_own_queue`: it waits for the other only where
-        `wait_for` says so."""
+        """`beside`: another engine, whose queue, kernels and times this one shares; its memory is its own, but for
+        `array_to_read`. What either does, it does after all that both were asked for before; `has_own_queue`: it waits
+        for the other only where `wait_for` says so."""
         self.device = device
         self.queue: cl.CommandQueue = beside.queue if beside and not has_own_queue else _make_queue(device)
-        self.workspace = Workspace(self.queue)
-        device.memory.add(self.workspace)
         self.profile: Profile = beside.profile if beside else Profile()
+        self.workspace = Workspace(self.queue, self.profile)
+        device.memory.add(self.workspace)
+        self._read_page: ReadPage = (
+            beside._read_page if beside and not has_own_queue else ReadPage(self.workspace, self.profile)
+        )
         self.pacer: Pacer = beside.pacer if beside else Pacer(times=device.step_times)
         self._kernels: dict[tuple[object, ...], cl.Kernel] = beside._kernels if beside else {}
         self._typed: dict[int, tuple[cl.Kernel, str]] = beside._typed if beside else {}
@@ -189,13 +193,29 @@ class Engine:
 
     def download(self, array: cl_array.Array) -> NDArray[Any]:
         """Copy to the host; waits for everything queued before."""
-        self.profile.count_read(array.nbytes)
-        result: NDArray[Any] = array.get(self.queue)
+        result: NDArray[Any] = self.begin_download(array).result(is_counted=True)
         return result
 
     def begin_download(self, array: cl_array.Array) -> PendingRead:
-        """The same without waiting: the host goes on while the device works."""
-        return PendingRead(self.queue, array, self.profile)
+        """The same without waiting: the host goes on while the device works. What is in an `array_to_read` is copied
+        with others, when the first of them is needed or `send_reads` is called."""
+        return self._read_page.begin(array) or PendingRead(self.queue, array, self.profile)
+
+    def array_to_read(self, shape: tuple[int, ...], dtype: DTypeLike) -> cl_array.Array:
+        """Memory for what the host will read of this frame; its contents are undefined. The next frame writes it
+        again (`Profile.begin`)."""
+        return self._read_page.array(shape, dtype)
+
+    def send_reads(self) -> None:
+        """Begin to copy all downloads that were begun, before more work is asked for that they need not wait for."""
+        self._read_page.send()
+
+    def copy_into(self, whole: cl_array.Array, start: int, part: cl_array.Array) -> None:
+        """Copy all of `part` into `whole`, from its byte `start` on. Not a kernel, as that of pyopencl's arrays."""
+        if part.nbytes:
+            self.profile.copies += 1
+            target, source = cast(Any, whole.data), cast(Any, part.data)
+            cl.enqueue_copy(self.queue, target, source, byte_count=part.nbytes, dst_offset=start)
 
     def close(self) -> None:
         """Wait for the device and give its memory back."""

@@ -67,11 +67,14 @@ class Profile:
         self.row = "input"
         self._slices: list[_Slice] = []
         self._depth = 0
+        self.frame = 0
+        """Counts the frames that have begun."""
         self.begin()
 
     def begin(self) -> None:
         """A frame begins; what one that failed has left is forgotten."""
         self._slices.clear()
+        self.frame += 1
         self._began_s = time.perf_counter()
         self._entered: list[tuple[float, str]] = [(self._began_s, self.row)]
         self.launches = 0
@@ -79,6 +82,8 @@ class Profile:
         busy the machine is."""
         self.reads = self.read_bytes = 0
         """Times that the host has waited for memory since then, and their bytes."""
+        self.copies = 0
+        """Of memory to, from and on the device since then, waited for or not."""
 
     def add_event(self, kernel: str, event: cl.Event) -> None:
         """The time of a launch or slice, just enqueued, counts under the current row."""

@@ -1,4 +1,4 @@
-"""Raw memory: copies and fills, queued, that pyopencl's arrays would launch kernels of their own for; and parts."""
+"""Raw memory: fills that pyopencl's arrays would launch kernels of their own for, and parts."""
 
 from __future__ import annotations
 
@@ -14,17 +14,6 @@ def fill_bytes(queue: cl.CommandQueue, array: cl_array.Array, value: int) -> Non
     """Set every byte of `array` to `value`, 0 to 255."""
     if array.nbytes:
         cl.enqueue_fill_buffer(queue, _memory(array), np.array([value], np.uint8), 0, array.nbytes)
-
-
-def copy_beginning(queue: cl.CommandQueue, array: cl_array.Array, values: cl_array.Array) -> None:
-    """Copy `values`, of the array's type, over its beginning."""
-    cl.enqueue_copy(queue, _memory(array), _memory(values), byte_count=values.nbytes)
-
-
-def copy_into(queue: cl.CommandQueue, whole: cl_array.Array, start: int, part: cl_array.Array) -> None:
-    """Copy all of `part` into `whole`, from its byte `start` on."""
-    if part.nbytes:
-        cl.enqueue_copy(queue, _memory(whole), _memory(part), byte_count=part.nbytes, dst_offset=start)
 
 
 def part_of(whole: cl_array.Array, start: int, shape: tuple[int, ...], dtype: DTypeLike) -> cl_array.Array:

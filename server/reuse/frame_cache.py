@@ -12,7 +12,6 @@ import pyopencl.array as cl_array
 
 from server.opencl.buffers import DeviceBuffer
 from server.opencl.engine import Engine
-from server.opencl.transfer import copy_into
 
 T = TypeVar("T")
 
@@ -64,7 +63,7 @@ class FrameCache:
             if key not in self._buffers:
                 self._buffers[key] = DeviceBuffer(self._engine.workspace, value.dtype)
             copy = self._buffers[key].array(value.shape)
-            copy_into(self._engine.queue, copy, 0, value)
+            self._engine.copy_into(copy, 0, value)
             return copy
         if isinstance(value, tuple):
             return tuple(self._copied(item, (*path, i)) for i, item in enumerate(value))

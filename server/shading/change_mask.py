@@ -9,16 +9,10 @@ import numpy as np
 import pyopencl.array as cl_array
 
 from protocol.frames import CameraModel
-from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine
 from server.transfer.sample_grid import SampleGrid
 from server.transfer.sampling import Upsampling
 from server.volume.raycast import Surface
-
-
-class _Buffers(StageBuffers):
-    changed = BufferDescription(np.uint8)
-    """[rows + 1, cols + 1] as mark_changes returns it."""
 
 
 def mark_changes(
@@ -36,7 +30,7 @@ def mark_changes(
     The cells are those of upsample.clh; the first lies before the first sample. ratio: R' / R at samples; refined:
     [h, w] float4, replaces it where w = 1; tolerance_m: of upsampling, used where spare > 0.
     """
-    changed = engine.buffers(_Buffers).changed.array((ratio.rows + 1, ratio.cols + 1))
+    changed = engine.array_to_read((ratio.rows + 1, ratio.cols + 1), np.uint8)
     defines = {"BICUBIC": 1} if upsampling == "bicubic" else {}
     engine.launch(
         engine.kernel("change_mask.cl", "mark_reached", **defines),

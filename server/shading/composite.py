@@ -59,7 +59,6 @@ class _Buffers(StageBuffers):
     srgb_codes = BufferDescription(np.uint8)
     shown = BufferDescription(np.uint8)
     """[h, w, 3] the camera's picture."""
-    picture = BufferDescription(np.uint8)
     """[h, w, 3] the result."""
 
 
@@ -193,7 +192,7 @@ def composite(engine: Engine, shown: NDArray[np.uint8], mixture: CompositeInputs
 def composite_on_device(engine: Engine, shown: NDArray[np.uint8], mixture: CompositeInputs) -> cl_array.Array:
     """The same where something is virtual, not read yet; valid until the next call."""
     buffers, camera = engine.buffers(_Buffers), mixture.camera
-    picture = buffers.picture.array((camera.height, camera.width, 3))
+    picture = engine.array_to_read((camera.height, camera.width, 3), np.uint8)
     codes = buffers.shown.upload(shown) if mixture.codes is None else mixture.codes
     others = (codes, srgb_table(engine), picture)
     launch_mixture(engine, "composite.cl", "composite", mixture, mixture_parameters(mixture), *others)

@@ -22,7 +22,6 @@ from server.objects.voxelize import DistanceGrid
 from server.opencl.buffers import BufferDescription, KeyedBufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float4, float16, int4
 from server.opencl.structs import VIEW_PARAMETERS
-from server.opencl.transfer import copy_into
 from server.transfer.real_depth_views import RealDepthViews
 
 Floats = NDArray[np.float64]
@@ -146,7 +145,7 @@ class _ObjectViews:
         room = max(count, 2 * len(self._grids))
         before, self.texels = self.texels, cl_array.empty(engine.queue, (room, self.shape.texels), np.uint32)
         if before is not None:
-            copy_into(engine.queue, self.texels, 0, before)
+            engine.copy_into(self.texels, 0, before)
         self._grids += [None] * (room - len(self._grids))
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel, RgbdFrame
 from server.input.measure import Measurement, intrinsics
 from server.maths.robust_location import Location, robust_location
-from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
+from server.opencl.buffers import DeviceBuffer
 from server.opencl.engine import Engine, float16, int4
 from server.volume.volume import Volume
 
@@ -41,11 +41,6 @@ _MOST_SAMPLES = 2304
 _LEAST_SCALE = 0.005
 _GROUP_SAMPLES = 8  # per side of a block of samples with common errors
 _NOISE_FLOOR = 0.02  # luminance below which a camera's noise is not proportional to its root
-
-
-class _Buffers(StageBuffers):
-    samples = BufferDescription(cl_types.float4)
-    """[rows, cols] as compare_exposure of exposure.cl writes them."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +70,7 @@ def compare_exposure(
     """Compare a picture, before it is integrated, with the volume's colours."""
     stride = max(1, math.ceil(math.sqrt(camera.width * camera.height / _MOST_SAMPLES)))
     shape = (camera.height // stride, camera.width // stride)
-    samples = engine.buffers(_Buffers).samples.array(shape)
+    samples = engine.array_to_read(shape, cl_types.float4)
     engine.launch(
         engine.kernel("exposure.cl", "compare_exposure"),
         shape[::-1],

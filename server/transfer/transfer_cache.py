@@ -66,8 +66,6 @@ class _Buffers(StageBuffers):
     """[rows, cols] as find_samples returns it."""
     kept = BufferDescription(np.int32)
     """[rows, cols] as choose_samples and store_samples return it."""
-    counts = BufferDescription(np.int32)
-    """[2 ORDERS + 1] of find_samples and choose_samples."""
     disc_parts = BufferDescription(cl_types.float4)
     disc_frames = BufferDescription(np.int32)
     """[places] of Cells."""
@@ -144,7 +142,7 @@ class TransferCache:
         self._frame = _Frame(surface, transfer, hits, met, places, words, parameters, defines)
         buffers, size = self._buffers, (transfer.cols, transfer.rows)
         found, kept = (of.array((transfer.rows, transfer.cols)) for of in (buffers.found, buffers.kept))
-        counts = buffers.counts.array((2 * ORDERS + 1,))
+        counts = engine.array_to_read((2 * ORDERS + 1,), np.int32)
         engine.fill(counts, 0)
         entries, claims = buffers.entries.array((places, words)), buffers.claims.array((places,))
         if not self._is_stored:  # the last frame was given up

@@ -19,7 +19,7 @@ from protocol.frames import CameraModel
 from server.maths.rigid import inverse_rigid
 from server.opencl.buffers import BufferDescription, BufferGroup, StageBuffers
 from server.opencl.engine import Engine, float16, int4
-from server.opencl.transfer import copy_beginning, fill_bytes
+from server.opencl.transfer import fill_bytes
 from server.volume.raycast import Surface, SurfaceBuffers, raycast
 from server.volume.volume import BRICK, Volume
 
@@ -130,7 +130,7 @@ class VisibilityState:
         view = raycast(self._engine, watch.camera, watch.volume_from_camera, self._volume, watch.buffers.surface)
         shape = (watch.camera.height, watch.camera.width)
         watch.seen = watch.buffers.seen.array(shape)
-        copy_beginning(self._engine.queue, watch.seen, view.positions)
+        self._engine.copy_into(watch.seen, 0, view.positions)
         return watch.seen
 
     def _compare(self, watch: _Watch, changed: cl_array.Array) -> None:
@@ -139,7 +139,7 @@ class VisibilityState:
                 self._look(watch)
             return
         before = self._buffers.before.array(watch.seen.shape)
-        copy_beginning(self._engine.queue, before, watch.seen)
+        self._engine.copy_into(before, 0, watch.seen)
         self._engine.launch(
             self._engine.kernel("visibility_state.cl", "compare_views"),
             (watch.camera.width, watch.camera.height),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from server.opencl.buffers import BufferDescription, DeviceBuffer, StageBuffers
 from server.opencl.engine import Engine
-from server.opencl.transfer import copy_beginning, fill_bytes
+from server.opencl.transfer import fill_bytes
 
 BRICK_VOXELS = 512
 BRICK_CELLS = 64
@@ -87,7 +87,7 @@ class BrickPool:
 
     def _grown(self, buffer: DeviceBuffer, old: cl_array.Array) -> cl_array.Array:
         new = buffer.array((self.capacity + 1, *old.shape[1:]))
-        copy_beginning(self._engine.queue, new, old)
+        self._engine.copy_into(new, 0, old)
         self._engine.queue.finish()
         if isinstance(old.data, cl.Buffer):
             old.data.release()

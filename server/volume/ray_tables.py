@@ -15,7 +15,7 @@ from server.volume.brick_pool import BrickPool, rounded, upload_list
 GREATEST_GAP = 15
 _CELL_ROWS = 16
 _SLICE_ITEMS = 64  # of a group of gaps_in_slices
-_UNCHANGED = np.array([1 << 30] * 3 + [-(1 << 30)] * 3, np.int32)
+_UNCHANGED = -(1 << 30)  # below all bricks
 
 
 class _Buffers(StageBuffers):
@@ -26,7 +26,7 @@ class _Buffers(StageBuffers):
     inner_gaps = KeyedBufferDescription(np.uint8)
     """Key 0: gaps along x, [2 bricks + 16]; key 1: along x and y, [4 bricks + 16]."""
     changed = BufferDescription(np.int32)
-    """[6] lowest and highest x, y, z of the bricks that have changed."""
+    """[6] lowest x, y, z, negated, and highest of the bricks that have changed."""
     near_solid = BufferDescription(np.uint8)
     """[n or more] 1 for listed bricks near a solid voxel."""
     idle_bricks = BufferDescription(np.int32)
@@ -83,7 +83,7 @@ class RayTables:
     def update(self) -> None:
         """Recompute the gaps around bricks that have become solid or empty."""
         engine, (x, y, z), bricks = self._engine, self.bricks, int4(*self.bricks, 0)
-        engine.workspace.copy(self._changed, _UNCHANGED)
+        engine.fill(self._changed, _UNCHANGED)
         engine.launch(
             engine.kernel("volume.cl", "gaps_in_slices"),
             (_SLICE_ITEMS * z,),

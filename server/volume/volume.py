@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from server.input.measure import intrinsics
 from server.maths.rigid import translation
-from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, KernelArgument, float16, int4
 from server.opencl.pending_read import PendingRead
 from server.opencl.structs import VOLUME_SHAPE
@@ -33,11 +32,6 @@ __all__ = ["BRICK", "BRICK_VOXELS", "TRUNCATION_VOXELS", "Bricks", "Volume", "Vo
 TRUNCATION_VOXELS = 4.0
 _GREATEST_BRICKS = 1 << 22
 _TILE = 4
-
-
-class _Buffers(StageBuffers):
-    near_surface = BufferDescription(np.uint8)
-    """[brick] 1 for bricks near the measured surface."""
 
 
 class VolumeSizeError(ValueError):
@@ -66,7 +60,7 @@ class Volume:
         self.truncation_m = TRUNCATION_VOXELS * self.voxel_m
         self.frames = 0
         self.is_full = False
-        self._engine, self._buffers = engine, _Buffers(engine.workspace)
+        self._engine = engine
         self._tables = RayTables(engine, self.bricks)
         budget_bytes = engine.device.volume_bytes if budget_bytes is None else budget_bytes
         host_bytes = 4 * budget_bytes if host_budget_bytes is None else host_budget_bytes
@@ -220,7 +214,7 @@ class Volume:
         self, camera: CameraModel, volume_from_camera: NDArray[np.float64], depth_m: cl_array.Array
     ) -> PendingRead:
         """[bricks] uint8, on its way: 1 for those near the measured surface."""
-        marked = self._buffers.near_surface.array((self.solid.size,))
+        marked = self._engine.array_to_read((self.solid.size,), np.uint8)
         fill_bytes(self._engine.queue, marked, 0)
         self._engine.launch(
             self._engine.kernel("volume.cl", "mark_bricks"),

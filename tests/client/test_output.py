@@ -29,7 +29,7 @@ AT_FIELDS = [
 ]
 ROWS = [
     *"input reconstruct surface dynamic_geometry radiance_transfer light_estimation rendering total".split(),  # noqa: SIM905
-    *"host launches reads read_bytes".split(),  # noqa: SIM905
+    *"host launches reads read_bytes copies".split(),  # noqa: SIM905
 ]
 
 

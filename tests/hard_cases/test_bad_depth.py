@@ -255,6 +255,22 @@ def test_pictures_of_another_size_are_refused(open_pipeline: Open) -> None:
     assert_sound(lit(pipeline))
 
 
+def test_pictures_of_another_type_are_refused(open_pipeline: Open) -> None:
+    pipeline = open_pipeline()
+    good = frame_of(good_depth(np.eye(4)))
+    for color, depth in (
+        (good.color / 255, good.depth),
+        (good.color.astype(np.uint16), good.depth),
+        (good.color, good.depth * 1e-3),
+    ):
+        with pytest.raises(
+            ValueError, match=r"colour is of type \w+, depth of \w+; srgb8 is uint8, depth uint16"
+        ) as caught:
+            pipeline.process(RgbdFrame(0, 0.0, color, depth, np.eye(4)))
+        assert "\n" not in str(caught.value)
+    assert_sound(lit(pipeline))
+
+
 @pytest.mark.parametrize("name", ["empty", "saturated", "one pixel"])
 def test_a_live_session_waits_for_depth_to_place_its_volume(open_pipeline: Open, name: str) -> None:
     pipeline = open_pipeline(Wishes(voxel_m=0.04))

@@ -199,12 +199,13 @@ class Gaps:
     def update(self, solid: NDArray[np.uint64]) -> NDArray[np.uint8]:
         """[octant, z, y, x]"""
         engine, (z, y, x), bricks = self._engine, self._shape, int4(*self._shape[::-1], 0)
-        changed = engine.workspace.upload("changed", np.array([1 << 30] * 3 + [-(1 << 30)] * 3, np.int32))
+        changed = engine.workspace.upload("changed", np.full(6, -(1 << 30), np.int32))
         listed, kernel = engine.workspace.upload("solid", solid), engine.kernel("volume.cl", "gaps_in_slices")
         tables = (listed, self._limit, self._occupied, changed, *self._gaps[:2])
         engine.launch(kernel, (self._items * z,), bricks, *tables, local=(self._items,))
         expected = twin.changed_box(self._known, solid != 0)
-        np.testing.assert_array_equal(engine.download(changed).reshape(2, 3), expected)
+        low, high = engine.download(changed).reshape(2, 3)
+        np.testing.assert_array_equal((-low, high), expected)
         self._known = solid != 0
         inner = self._compared(1, self._compared(0, twin.start_gaps(solid, self._limit)[None]))
         kernel, rest = engine.kernel("volume.cl", "gaps_along_z"), (self._limit, changed, self._gaps[2])

@@ -16,7 +16,6 @@ from server.client_session import ClientSession
 from server.opencl.buffers import BufferDescription, BufferGroup, KeyedBufferDescription, StageBuffers, Workspace
 from server.opencl.device import Device
 from server.opencl.engine import Engine
-from server.opencl.transfer import copy_into
 from server.scene.placement import Placement
 from tests.scenes.analytic import look, plane, room
 from tests.scenes.meshes import soup_of
@@ -62,7 +61,7 @@ def test_nothing_is_made_before_the_first_use(engine: Engine) -> None:
 def test_copy_into(engine: Engine) -> None:
     """From a byte on, and no farther than the part is long."""
     whole = engine.workspace.upload("whole", np.arange(10, dtype=np.int32))
-    copy_into(engine.queue, whole, 12, engine.workspace.upload("part", np.array([70, 80], np.int32)))
+    engine.copy_into(whole, 12, engine.workspace.upload("part", np.array([70, 80], np.int32)))
     np.testing.assert_array_equal(engine.download(whole), [0, 1, 2, 70, 80, 5, 6, 7, 8, 9])
 
 

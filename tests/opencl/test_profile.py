@@ -145,10 +145,12 @@ def test_launches_and_reads_are_counted(engine: Engine) -> None:
     engine.download(halved)
     engine.download(depth)
     engine.begin_download(depth)  # nobody waits for it
+    engine.copy_into(depth, 0, halved)
     profile = engine.profile
     assert (profile.launches, profile.reads, profile.read_bytes) == (3, 2, 4 * (64 + 256))
+    assert profile.copies == 5, "an upload, three reads, one on the device"
     profile.collect()
-    assert (profile.launches, profile.reads, profile.read_bytes) == (0, 0, 0)
+    assert (profile.launches, profile.reads, profile.read_bytes, profile.copies) == (0, 0, 0, 0)
 
 
 def test_a_host_that_is_held_up_moves_no_kernel_out_of_the_frame(clock: Clock) -> None:

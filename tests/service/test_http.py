@@ -106,6 +106,7 @@ def test_metrics_have_every_row_before_the_first_frame(server) -> None:
         "queue_age_seconds_count",
         "frames_processed_total",
         "reads_total",
+        "copies_total",
         "sessions",
     ):
         assert found[f"probeless_{name}",] == 0

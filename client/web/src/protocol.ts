@@ -433,6 +433,8 @@ export interface Timings {
   reads: number;
   /** Bytes of those reads. */
   read_bytes: number;
+  /** Copies of memory to, from and on the device, waited for or not. */
+  copies: number;
 }
 
 /** An effect that did not run, the reason, and a bound on the change, in display units (1 is 1/255). */

@@ -10,7 +10,6 @@ import pyopencl.cltypes as cl_types
 from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
-from server.opencl.buffers import BufferDescription, StageBuffers
 from server.opencl.engine import Engine, float4
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
@@ -21,11 +20,6 @@ _BLOCKS_ACROSS = 40  # blocks of pixels along a picture's width
 _TOLERANCE_VOXELS = 1.5
 
 Floats = NDArray[np.float64]
-
-
-class _Buffers(StageBuffers):
-    seen = BufferDescription(cl_types.float4)
-    """[6, rows, cols] as gather_patches writes it."""
 
 
 def _vectors() -> Floats:
@@ -86,7 +80,7 @@ class PatchesInPicture:
         """radiance: [h, w] float4 as in Measurement, in the units of the first picture. volume_from_camera: [4, 4]."""
         step = max(2, camera.width // _BLOCKS_ACROSS)
         cols, rows = camera.width // step, camera.height // step
-        seen = engine.buffers(_Buffers).seen.array((6, rows, cols))
+        seen = engine.array_to_read((6, rows, cols), cl_types.float4)
         engine.launch(
             engine.kernel("patches.cl", "gather_patches"),
             (cols, rows),

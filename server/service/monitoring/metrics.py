@@ -66,6 +66,7 @@ class Metrics:
         self.launches = self._counter("launches", "Kernels of all frames")
         self.reads = self._counter("reads", "Times that frames waited for memory of the device")
         self.read_bytes = self._counter("read_bytes", "Bytes of these reads")
+        self.copies = self._counter("copies", "Copies to, from and on the device")
         self.processed = self._counter("frames_processed", "Frames composited")
         self.dropped = self._counter("frames_dropped", "Frames dropped", ("reason",))
         self.refused = self._counter("refused", "Connections refused", ("code",))
@@ -107,6 +108,7 @@ class Metrics:
         self.launches.inc(timings.launches)
         self.reads.inc(timings.reads)
         self.read_bytes.inc(timings.read_bytes)
+        self.copies.inc(timings.copies)
 
     def render(self) -> bytes:
         """All metrics in Prometheus's text format."""

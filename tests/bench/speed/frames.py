@@ -150,6 +150,7 @@ def _add_counts(part: Part, found: Measured) -> None:
     part.add("moving camera: kernels launched, median", found.median("launches"), "", "<= 40")
     part.add("moving camera: blocking reads, median", found.median("reads"), "", "<= 3")
     part.add("moving camera: bytes read, median", found.median("read_bytes"), "B")
+    part.add("moving camera: copies to, from and on the device, median", found.median("copies"), "", "<= 12")
     in_rows = [sum(getattr(timings, row) for row in TIMING_ROWS) / timings.total for timings in found.timings]
     part.add("moving camera: share of the frame that no row tells", 100 * (1 - median(in_rows)), "%", "<= 5")
 

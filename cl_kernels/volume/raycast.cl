@@ -205,7 +205,7 @@ static inline void look_beside(const Rays rays, const Walked *walked, const int 
 }
 
 #define TRIES 3             // where surface is looked for first, along rays of the rest
-#define TURNS (LANES > 1 ? 16 : 1)  // of LANES rays an item: one in twenty of the rest is walked
+#define TURNS (LANES > 1 ? 16 : 1)  // of LANES rays that are done together: one in twenty of the rest is walked
 #define ENTRY (2 + TRIES)   // of `rest`: the pixel, then as bits of float voxels where its ray is tried, and where it begins to be walked
 
 // Adds rays to the rest: `left` of the `count` pixels.
@@ -305,13 +305,11 @@ static inline RestRays load_rest(const Volume volume, const float4 intrinsics, c
     return rays;
 }
 
-// The rays in `rest`, TURNS times LANES of them an item. All are tried at the first place; those that meet nothing there move together to be
-// tried at the next, and are walked in the end. Which are done together does not matter to any of them.
-kernel void raycast_rest(VIEW_PARAMETERS, global const int *rest, global float4 *positions, global float4 *normals) {
-    const int first = get_global_id(0) * TURNS * LANES;
-    int count = min(rest[0] - first, TURNS * LANES);
-    if (count <= 0) return;
-    const Volume volume = VOLUME_OF_PARAMETERS;
+// `count` rays in `rest` from the `first` on, at most TURNS * LANES. All are tried at the first place; those that meet nothing there move
+// together to be tried at the next, and are walked in the end. Which are done together does not matter to any of them.
+static void cast_rest(const Volume volume, const float4 intrinsics, const float16 volume_from_camera, const int width,
+                      const float greatest_depth_m, global const int *farthest, global const int *rest, const int first, int count,
+                      global float4 *positions, global float4 *normals) {
     int looking[TURNS * LANES + LANES];
     for (int i = 0; i < count; i++) looking[i] = first + i;
     for (int attempt = 0; attempt <= TRIES; attempt++) {
@@ -332,4 +330,14 @@ kernel void raycast_rest(VIEW_PARAMETERS, global const int *rest, global float4 
         }
         count = missed;
     }
+}
+
+// The rays in `rest`: each of `items` work-items does the same number, in whole LANES.
+kernel void raycast_rest(VIEW_PARAMETERS, const int items, global const int *rest, global float4 *positions, global float4 *normals) {
+    const int share = ((rest[0] + items - 1) / items + LANES - 1) / LANES * LANES;
+    const int begin = get_global_id(0) * share, end = min(begin + share, rest[0]);
+    const Volume volume = VOLUME_OF_PARAMETERS;
+    for (int first = begin; first < end; first += TURNS * LANES)
+        cast_rest(volume, intrinsics, volume_from_camera, width, greatest_depth_m, farthest, rest, first, min(end - first, TURNS * LANES),
+                  positions, normals);
 }

@@ -71,15 +71,14 @@ class ShadowCause:
         is_sent, by_views = scene.light.surface_gain > 0.0, scene.depth_views is not None
         return ShadowCause(scene.volume, scene.objects, light, is_sent, by_views, scene.rays, scene.ray_length_m)
 
-    def is_near(self, other: ShadowCause) -> bool:
-        """Whether shadows under `other` are nearly the same."""
+    def has_same_things(self, other: ShadowCause) -> bool:
+        """Whether all but the light is the same."""
         return (
             (self.is_sent, self.by_views) == (other.is_sent, other.by_views)
             and self.ray_length_m == other.ray_length_m
             and self.volume is other.volume
             and self.rays is other.rays
             and _are_same(self.objects, other.objects)
-            and light_difference(other.light, self.light) <= STEADY
         )
 
 
@@ -87,47 +86,59 @@ class KeptShadows:
     """The causes of the shadows of one session's last frames."""
 
     def __init__(self) -> None:
-        self._causes: deque[ShadowCause] = deque(maxlen=_REMEMBERED)
+        self._last: ShadowCause | None = None
+        self._lights: deque[SplitSh] = deque(maxlen=_REMEMBERED)
+        """Of the last frames, as far back as all else was the same."""
         self.now = 0
         """Number of the last frame, from 1; 0: none."""
 
     def since(self, cause: ShadowCause) -> int:
         """The first frame from which on all causes are nearly `cause`; if the last one's is not, this frame."""
-        first = self.now + 1
-        for earlier in reversed(self._causes):
-            if not earlier.is_near(cause):
-                break
-            first -= 1
-        return first
+        if not self._is_as_last(cause):
+            return self.now + 1
+        is_far = light_differences(cause.light, self._lights)[::-1] > STEADY
+        return self.now + 1 - int(np.argmax([*is_far, True]))
 
     def begin_frame(self, cause: ShadowCause) -> int:
         """Number of this frame, from 1, whose shadows are kept."""
-        self._causes.append(cause)
+        if not self._is_as_last(cause):
+            self._lights.clear()
+        self._last = cause
+        self._lights.append(cause.light)
         self.now += 1
         return self.now
 
+    def _is_as_last(self, cause: ShadowCause) -> bool:
+        return self._last is not None and cause.has_same_things(self._last)
 
-def light_difference(light: SplitSh, before: SplitSh) -> float:
-    """How much `before` differs from `light` at the level where their rests are nearest, in the place where most.
+
+def light_differences(light: SplitSh, before: Sequence[SplitSh]) -> NDArray[np.float64]:
+    """[n] how much each of `before` differs from `light` at the level where their rests are nearest, in the place where
+    most.
 
     A share of the norm of the rest, or of the discs if that is larger: virtual things send light of the discs, which
     counts by how much it adds to the rest. Infinite where one has other places, or is dark and the other is not.
     """
-    if light.rest.shape != before.rest.shape:
-        return np.inf
-    size, other = _norms(light.rest), _norms(before.rest)
+    found = np.full(len(before), np.inf)
+    alike = [k for k, one in enumerate(before) if one.rest.shape == light.rest.shape]
+    if not alike:
+        return found
+    rest, discs = np.stack([before[k].rest for k in alike]), np.stack([before[k].discs for k in alike])
+    size, other = _norms(light.rest), _norms(rest)
     is_dark = (size == 0.0) | (other == 0.0)
-    if is_dark.any():
-        return 0.0 if is_dark.all() and not (size.any() or other.any()) else np.inf
-    level = np.maximum(np.einsum("pij,pij->p", light.rest, before.rest), 0.0) / other**2
-    of_rest = _norms(light.rest - level[:, None, None] * before.rest) / size
-    of_discs = _norms(light.discs - level[:, None, None] * before.discs) / np.maximum(_norms(light.discs), size)
-    return float(np.maximum(of_rest, of_discs).max())
+    level = np.maximum(np.einsum("pij,npij->np", light.rest, rest), 0.0) / np.where(is_dark, 1.0, other**2)
+    by = level[..., None, None]
+    of_rest = _norms(light.rest - by * rest) / np.where(is_dark, 1.0, size)
+    of_discs = _norms(light.discs - by * discs) / np.where(is_dark, 1.0, np.maximum(_norms(light.discs), size))
+    differ = np.maximum(of_rest, of_discs).max(axis=1)
+    are_dark = is_dark.all(axis=1) & ~(size.any() | other.any(axis=1))
+    found[alike] = np.where(is_dark.any(axis=1), np.where(are_dark, 0.0, np.inf), differ)
+    return found
 
 
 def _norms(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[places]."""
-    return np.asarray(np.linalg.norm(coefficients, axis=(1, 2)))
+    """[..., places]."""
+    return np.asarray(np.sqrt(np.einsum("...ij,...ij->...", coefficients, coefficients)))
 
 
 def _are_same(objects: Sequence[Placed], others: Sequence[Placed]) -> bool:

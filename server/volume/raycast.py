@@ -22,7 +22,9 @@ LABEL_NONE, LABEL_STATIC, LABEL_DYNAMIC, LABEL_FILLED = 0, 1, 2, 3
 _TILE = 8  # as in raycast.cl
 _SPACING = 2  # as in raycast.cl
 _REST_ENTRY = 5  # ENTRY of raycast.cl
-_REST_TURNS = 16  # TURNS of raycast.cl
+_REST_ITEMS = 256
+"""Work-items that share these rays on a processor. PoCL's threads take 64 groups at a time: while only the first of 600
+had work, one of two cores did most of it."""
 _FARTHEST = int(np.float32(np.inf).view(np.int32))
 
 
@@ -83,9 +85,8 @@ def raycast(
     squares = (-(-camera.width // (_SPACING * lanes)), -(-camera.height // _SPACING))
     engine.launch(_kernel(engine, "raycast"), squares, *view, positions, normals)
     engine.launch(_kernel(engine, "raycast_between"), squares, *view, positions, normals, rest)
-    few = (4,) if lanes > 1 else (64,)  # items of a group: only the first of them have work
-    items = -(-pixels // (lanes * _REST_TURNS if lanes > 1 else 1))
-    engine.launch(_kernel(engine, "raycast_rest"), (items,), *view, rest, positions, normals, local=few)
+    items, group = (_REST_ITEMS, 1) if lanes > 1 else (pixels, 64)
+    engine.launch(_kernel(engine, "raycast_rest"), (items,), *view, items, rest, positions, normals, local=(group,))
     return Surface(positions, normals, buffers.labels.array(size))
 
 

@@ -13,7 +13,7 @@ from protocol.frames import CameraModel
 from server.objects.rasterize import Placed, VirtualSurface
 from server.opencl.engine import Engine
 from server.shading.differential_rendering import VIRTUAL_STRIDE, shadow_real, shadow_virtual
-from server.shading.kept_shadows import LONGEST, STEADY, KeptShadows, ShadowCause, SplitSh, light_difference
+from server.shading.kept_shadows import LONGEST, STEADY, KeptShadows, ShadowCause, SplitSh, light_differences
 from server.shading.shadow_cells import RealShadows, ShadowCells, VirtualOcclusions, places_for
 from server.shading.traced_scene import TracedScene, trace_scene, upload_light
 from server.transfer.radiance_transfer import Transfer, direction_sets, transfer_radiance
@@ -57,6 +57,14 @@ def room_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
 def split(rest: Floats, discs: Floats | None = None) -> SplitSh:
     """Of one place."""
     return SplitSh(rest[None], (np.zeros_like(rest) if discs is None else discs)[None])
+
+
+def light_difference(light: SplitSh, before: SplitSh) -> float:
+    """Of one, among others."""
+    nothing, two_places = split(np.zeros_like(LIGHT)), SplitSh(np.stack([LIGHT, LIGHT]), np.zeros((2, 16, 3)))
+    _, found, _ = light_differences(light, [nothing, before, two_places])
+    assert light_differences(light, [before]) == [found]
+    return float(found)
 
 
 def test_a_difference_of_lights_does_not_depend_on_their_level() -> None:
@@ -153,15 +161,15 @@ def test_shadows_of_other_rays_or_another_scan_are_others(engine: Engine) -> Non
     stage = Stage.of(engine)
     scene = stage.scene(LIGHT)
     cause, light = ShadowCause.of(scene), scene.light
-    assert cause.is_near(ShadowCause.of(stage.scene(LIGHT)))
+    assert cause.has_same_things(ShadowCause.of(stage.scene(LIGHT)))
     others = [
         replace(scene, rays=direction_sets(33, 4)),
         replace(scene, ray_length_m=0.5 * FAR_M),
         replace(scene, volume=fill_volume(engine, FLOOR, 2 * VOXEL_M)),
         replace(scene, light=replace(light, surface_gain=1.0)),
     ]
-    assert not any(cause.is_near(ShadowCause.of(other)) for other in others)
-    assert not cause.is_near(replace(cause, by_views=True))
+    assert not any(cause.has_same_things(ShadowCause.of(other)) for other in others)
+    assert not cause.has_same_things(replace(cause, by_views=True))
 
 
 # ---- shadows on real surface ---------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from protocol.frames import CameraModel
 from server.opencl.engine import Engine
+from server.volume import raycast
 from server.volume.raycast import GREATEST_DEPTH_M
 from server.volume.volume import Volume
 from tests.reference.integrate import voxel_centers
@@ -240,6 +241,17 @@ def test_behind_a_silhouette_the_wall_is_seen(engine: Engine) -> None:
     ring = seen & ~truth.is_continuous
     assert ring.sum() > 300
     assert (~hit[ring]).mean() < 0.01
+
+
+@pytest.mark.parametrize("items", [1, 7, 4096])
+def test_the_rest_is_the_same_however_it_is_shared(engine: Engine, items: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, views, new = SCENES["ball in a room"]
+    volume = fused(engine, scene, views)
+    as_usual = cast(engine, volume, CAMERA, new)
+    cast(engine, volume, CAMERA, views[0])  # in the same memory: what is left out would show another view
+    monkeypatch.setattr(raycast, "_REST_ITEMS", items)
+    for found, expected in zip(cast(engine, volume, CAMERA, new), as_usual, strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("far_m", [1e4, -1e4])

@@ -190,7 +190,7 @@ def composite(engine: Engine, shown: NDArray[np.uint8], mixture: CompositeInputs
 
 
 def composite_on_device(engine: Engine, shown: NDArray[np.uint8], mixture: CompositeInputs) -> cl_array.Array:
-    """The same where something is virtual, not read yet; valid until the next call."""
+    """The same where something is virtual, not read yet; valid in this frame."""
     buffers, camera = engine.buffers(_Buffers), mixture.camera
     picture = engine.array_to_read((camera.height, camera.width, 3), np.uint8)
     codes = buffers.shown.upload(shown) if mixture.codes is None else mixture.codes

@@ -228,7 +228,8 @@ def test_a_recording_is_sent_as_it_is_when_the_link_is_free(
             write_message(file, message)
     ages_ms = {}
     for adapts in ("yes", "no"):
-        with impaired(server.url, DELAY_S, BYTES_PER_S / 2) as link, closing(open_page(link.url, size=(900, 900))) as page:
+        narrow = impaired(server.url, DELAY_S, BYTES_PER_S / 2)
+        with narrow as link, closing(open_page(link.url, size=(900, 900))) as page:
             note_ages(page)
             page.locator("input[name=source][value=recorded]").check()
             page.locator("[name=adapt]").select_option(adapts)

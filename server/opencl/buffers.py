@@ -12,7 +12,7 @@ import pyopencl as cl
 import pyopencl.array as cl_array
 from numpy.typing import DTypeLike, NDArray
 
-from server.opencl.parts import Parts, pack, part_alignment_bytes, place
+from server.opencl.parts import Parts, Shapes, pack, part_alignment_bytes, place
 from server.opencl.profile import Profile
 
 Group = TypeVar("Group", bound="StageBuffers")
@@ -67,24 +67,28 @@ class DeviceBuffer:
             return self.current
         return self.upload(values)
 
-    def parts(self, shapes: Mapping[str, tuple[tuple[int, ...], DTypeLike]]) -> Parts:
+    def parts(self, shapes: Shapes) -> Parts:
         """Several arrays in this buffer, which must be of uint8; contents are kept as in `array`."""
         starts, size = place(shapes, part_alignment_bytes(self._workspace.queue.device))
         return Parts(self.array((size,)), starts, shapes)
 
     def upload_parts(self, arrays: Mapping[str, NDArray[Any]]) -> Parts:
         """Copy `arrays` into this buffer, which must be of uint8, at once; the caller may change them."""
-        shapes = {part: (values.shape, values.dtype) for part, values in arrays.items()}
-        parts = self.parts(shapes)
-        self._workspace.send(parts.memory, pack(arrays, parts.starts, parts.memory.nbytes))
-        return parts
+        packed, starts, shapes = self._packed(arrays)
+        memory = self.array(packed.shape)
+        self._workspace.hand_over(memory, packed)
+        return Parts(memory, starts, shapes)
 
     def refresh_parts(self, arrays: Mapping[str, NDArray[Any]]) -> Parts:
         """Copy `arrays` into this buffer, which must be of uint8, as `refresh` does."""
-        shapes = {part: (values.shape, values.dtype) for part, values in arrays.items()}
-        starts, size = place(shapes, part_alignment_bytes(self._workspace.queue.device))
-        packed = pack(arrays, starts, size)
+        packed, starts, shapes = self._packed(arrays)
         return Parts(self.refresh(packed), starts, shapes)
+
+    def _packed(self, arrays: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.uint8], dict[str, int], Shapes]:
+        """The bytes of all, where each begins, and their shapes."""
+        shapes: Shapes = {part: (values.shape, values.dtype) for part, values in arrays.items()}
+        starts, size = place(shapes, part_alignment_bytes(self._workspace.queue.device))
+        return pack(arrays, starts, size), starts, shapes
 
 
 class BufferDescription:
@@ -164,9 +168,9 @@ class Workspace:
     def copy(self, array: cl_array.Array, values: NDArray[Any]) -> None:
         """Copy `values` over the beginning of an array. Waits for nothing: a copy of them is kept until it is done."""
         if values.nbytes:
-            self.send(array, np.array(values, order="C"))
+            self.hand_over(array, np.array(values, order="C"))
 
-    def send(self, array: cl_array.Array, values: NDArray[Any]) -> None:
+    def hand_over(self, array: cl_array.Array, values: NDArray[Any]) -> None:
         """As `copy`, of contiguous values that nobody changes from now on: no copy of them is made."""
         self._profile.copies += 1
         memory = cast(Any, array.data)

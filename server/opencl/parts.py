@@ -20,6 +20,10 @@ _STEP_BYTES = 4096
 """Buffers grow in such steps, so that a part that changes by little seldom takes new memory."""
 
 
+Shapes = Mapping[str, tuple[tuple[int, ...], DTypeLike]]
+"""Shape and type of each part."""
+
+
 @dataclass(frozen=True)
 class Parts:
     """Arrays in one buffer on the device."""
@@ -28,7 +32,7 @@ class Parts:
     """All parts, uint8."""
     starts: Mapping[str, int]
     """Byte at which each begins."""
-    shapes: Mapping[str, tuple[tuple[int, ...], DTypeLike]]
+    shapes: Shapes
 
     def array(self, name: str) -> cl_array.Array:
         """One part, in the same memory."""
@@ -40,7 +44,7 @@ def part_alignment_bytes(device: cl.Device) -> int:
     return max(device.mem_base_addr_align // 8, LEAST_ALIGNMENT_BYTES)
 
 
-def place(shapes: Mapping[str, tuple[tuple[int, ...], DTypeLike]], alignment_bytes: int) -> tuple[dict[str, int], int]:
+def place(shapes: Shapes, alignment_bytes: int) -> tuple[dict[str, int], int]:
     """Where each array begins, one after the other, and the bytes in all."""
     starts, end = {}, 0
     for name, (shape, dtype) in shapes.items():

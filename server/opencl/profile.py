@@ -68,7 +68,7 @@ class Profile:
         self._slices: list[_Slice] = []
         self._depth = 0
         self.frame = 0
-        """Counts the frames that have begun."""
+        """Another number for each frame."""
         self.begin()
 
     def begin(self) -> None:

@@ -53,7 +53,7 @@ class PartRead(PendingRead):
 
 
 class ReadPage:
-    """Of one engine. Places are given anew in each frame, one after the other."""
+    """Of the engines of one queue. Places are given anew in each frame, one after the other."""
 
     def __init__(self, workspace: Workspace, profile: Profile) -> None:
         self._workspace, self._profile = workspace, profile

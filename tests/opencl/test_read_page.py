@@ -91,6 +91,14 @@ def test_a_page_grows_until_it_holds_a_frame(engine: Engine) -> None:
     assert engine.bytes_held == held
 
 
+def test_what_was_written_before_a_page_was_full_is_read(engine: Engine) -> None:
+    engine.profile.begin()
+    early, late = numbers((100,), np.float32), numbers((3_000_000,), np.float32, 1)
+    first, second = written(engine, early), written(engine, late)  # more than a page holds at first
+    for array, values in ((first, early), (second, late)):
+        np.testing.assert_array_equal(engine.begin_download(array).result(), values)
+
+
 def test_memory_is_bounded_where_no_frame_begins(engine: Engine) -> None:
     values = numbers((1 << 20,), np.uint8)
     for _ in range(64):

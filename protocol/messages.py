@@ -517,7 +517,8 @@ class LeftOut(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     reason: str
     """Why it was not needed, in words."""
     error_bound: float | None
-    """In display units; None: no bound is known."""
+    """In display units; None: no bound is known. Where the reason says that it was measured, it leaves out a thousandth
+    of the pixels."""
 
 
 class OperatingPoint(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -307,7 +307,11 @@ class Pipeline:
         timings = self._timings()
         self._frames += 1
         self._room.changes += 1
-        others = (*self._transfer.left_out(), *self._room.lamps.left_out()) if geometry.tracking != "lost" else ()
+        others = (
+            (*self._transfer.left_out(rendered.kept_bounds()), *self._room.lamps.left_out())
+            if geometry.tracking != "lost"
+            else ()
+        )
         return FrameResult(
             color=picture,
             layer=rendered.layer,

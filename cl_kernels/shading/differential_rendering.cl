@@ -44,10 +44,12 @@ static void write_block(const Grid grid, global const float4 *positions, global 
 // SHARERS items a block of `step` x `step` samples, which get the ratio of the first of them, or none where that has no surface.
 // whole, whole_shaded [rows][cols]: ratio and R with what the discs bring, written if has_discs.
 // Samples whose cell keeps a ratio get that one. Of the others, if `asking`, each asks to fill its cell -> asked [rows][cols], found
-// [rows][cols]: the cell's value then.
+// [rows][cols]: the cell's value then; changes: see count_change. own_cells [rows][cols] of store_samples of transfer_cache.cl, if
+// has_cells: -1 where a sample has the transfer of another.
 kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, global const float *transfer, global const float4 *hits,
-                        DISC_SAMPLES, SHADOW_CELLS, const int asking, global int4 *asked, global float4 *found, global float4 *ratio,
-                        global float4 *shaded, global float4 *whole, global float4 *whole_shaded) {
+                        DISC_SAMPLES, SHADOW_CELLS, const int asking, const int has_cells, global const int *own_cells, global int4 *asked,
+                        global float4 *found, global int *changes, global float4 *ratio, global float4 *shaded, global float4 *whole,
+                        global float4 *whole_shaded) {
     SHARED_PARTS
     const int sharer = SHARER;
     const int col = step * (get_global_id(0) / SHARERS);
@@ -80,8 +82,10 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
         without = shading_without(arrives, without, openness[sample], hits[sample]);
         const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
         const float3 own = fmax(without - taken, floor) / fmax(without, floor);
-        of_ratio = (float4)(cell.is_kept ? cell.value.xyz : with_found(cells, cell, own, sample, &number), 1.0f);
+        const int is_lent = has_cells && own_cells[sample] < 0;
+        of_ratio = (float4)(cell.is_kept ? cell.value.xyz : with_found(cells, cell, own, sample, is_lent, &number), 1.0f);
         if (asking) found[sample] = of_ratio;
+        if (asking) count_change(cell, cell.value.xyz, own, (float3)(1.0f), is_lent, changes);
         of_shaded = (float4)(without, 1.0f);
     }
     if (!is_known) cell.place = -1;
@@ -152,9 +156,9 @@ kernel void bounce_real(SURROUNDINGS_PARAMETERS, SAMPLE_BUFFERS, const int most,
 // scene.every: a sample traces every n-th direction of its set; its neighbours trace others. -> occluded [rows][cols] (rgb, w = 1 valid)
 // at the samples `around` (x0 y0 x1 y1, half-open).
 // Samples whose cell keeps what is taken, over cells.level, get that; the others ask to fill it, in each frame with the next part of
-// their directions. -> found, asked: as in shadow_real.
+// their directions. -> found, asked, changes: as in shadow_real.
 kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const float4 *positions, global const float4 *normals, global const int *shown,
-                           SHADOW_CELLS, global int4 *asked, global float4 *found, global float4 *occluded) {
+                           SHADOW_CELLS, global int4 *asked, global float4 *found, global int *changes, global float4 *occluded) {
     SHARED_PARTS
     const int sharer = SHARER;
     const int col = around.x + get_global_id(0) / SHARERS;
@@ -163,12 +167,13 @@ kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const flo
     const int is_inside = col < around.z && row < around.w;
     const int sample = is_inside ? row * grid.cols + col : 0, every = scene.every, pixel = is_inside ? sample_pixel(grid, row, col) : 0;
     const float4 position = positions[pixel], normal = normals[pixel];
+    const int place = place_of_object(scene.light.table, light_table, shown[pixel]);
     const ShadowCell cell = find_shadow(cells, table, position, normal.xyz, shown[pixel]);
     float4 own = (float4)(0.0f);
     if (is_inside && !cell.is_kept) {
         const Volume volume = VOLUME_OF_SCENE;
         const Objects things = OBJECTS_OF_SCENE(own_offset_m(scene.objects.count, grids_of(object_table), shown[pixel]));
-        const Arriving arrives = ARRIVING_OF_SCENE(place_of_object(scene.light.table, light_table, shown[pixel]));
+        const Arriving arrives = ARRIVING_OF_SCENE(place);
         own = taken_from_virtual(volume, things, arrives, position, normal.xyz, direction_set(row, col),
                                  direction_subset(row, col + max(cells.now - 1, 0), every) + every * sharer, every * SHARERS);
     }
@@ -177,7 +182,11 @@ kernel void shadow_virtual(SCENE_PARAMETERS, const int4 around, global const flo
     occluded[sample] = taken;
     if (cells.places == 0) return;
     uint number = 0;
-    const float3 value = cell.is_kept ? cell.value.xyz : with_found(cells, cell, taken.xyz / cells.level, sample, &number);
+    const float3 value = cell.is_kept ? cell.value.xyz : with_found(cells, cell, taken.xyz / cells.level, sample, 0, &number);
+    if (position.w > 0.0f) {
+        const float3 open = open_shading(normal.xyz, coefficients_of(scene.light.table, light_table, place));
+        count_change(cell, open - cells.level * cell.value.xyz, open - taken.xyz, open, 0, changes);
+    }
     if (cell.is_true) occluded[sample] = (float4)(cells.level * value, 1.0f);
     found[sample] = (float4)(value, 0.0f);
     ask_to_keep(cell, number, sample, table, asked);

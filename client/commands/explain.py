@@ -11,8 +11,10 @@ from client.gallery.play import play, wishes_of
 from client.gallery.source import GallerySource
 from client.options.capture import Capture
 from protocol.messages import LeftOut, Plan, Wishes
+from server.culling.rules import SHOWN
 from server.opencl.device import open_device
 from server.reuse.temporal_reuse import ECHO, NOISE
+from server.shading.kept_changes import MEASURED
 
 PURPOSES = {
     "rasterize": "draws the virtual objects",
@@ -75,8 +77,10 @@ def _gallery_plan(source: GallerySource, requested: Wishes, chosen: int, device_
 
 def lines(title: str, plan: Plan) -> Iterator[str]:
     """A plan as lines, one per effect."""
-    unseen = {(left.reason, left.error_bound) for left in plan.left_out if is_unseen(left)}  # each reason counts once
-    most = sum(bound or 0.0 for _, bound in unseen)
+    unseen = [left for left in plan.left_out if is_unseen(left)]
+    most = sum(
+        bound or 0.0 for _, bound in {(left.reason, left.error_bound) for left in unseen}
+    )  # a reason counts once
     yield f"{title}: {len(plan.run)} effects run, {len(plan.left_out)} are left out."
     width = max(map(len, (*plan.run, *(left.effect for left in plan.left_out))))
     if plan.point is not None:
@@ -88,7 +92,7 @@ def lines(title: str, plan: Plan) -> Iterator[str]:
         yield "Left out:"
     for left in plan.left_out:
         yield f"  {left.effect:{width}}  {left.reason} ({_bound(left)})"
-    which = "at most one pixel in a thousand" if any(map(is_of_noise, plan.left_out)) else "no pixel"
+    which = "at most one pixel in a thousand" if any(map(is_of_noise, unseen)) else "no pixel"
     yield f"Together, effects left out as invisible change {which} by more than {most:.2f}/255, before rounding."
 
 
@@ -99,7 +103,7 @@ def is_unseen(left: LeftOut) -> bool:
 
 def is_of_noise(left: LeftOut) -> bool:
     """Whether its bound holds for all but a thousandth of the pixels."""
-    return left.reason in (NOISE, ECHO)
+    return left.reason in (NOISE, ECHO) or left.reason.endswith(MEASURED)
 
 
 def _bound(left: LeftOut) -> str:
@@ -107,7 +111,7 @@ def _bound(left: LeftOut) -> str:
         return "change unknown"
     if left.error_bound == 0:
         return "changes nothing"
-    if not is_unseen(left):
+    if left.error_bound >= SHOWN:
         return "change not bounded"
     which = "at most one pixel in a thousand" if is_of_noise(left) else "no pixel"
     return f"changes {which} by more than {left.error_bound:.2f}/255"

@@ -38,7 +38,7 @@ from server.quality.settings import Settings
 from server.reuse.frame_cache import FrameCache
 from server.reuse.temporal_reuse import ReuseDecision
 from server.shading.composite import CompositeInputs, composite, composite_on_device, shown_picture
-from server.shading.kept_shadows import SHADOWS_OF_KNOWN_PLACES
+from server.shading.kept_changes import NOT_SHOWN, KeptBounds, KeptChanges, shadows_left_out
 from server.shading.layer import Layer, compose_layer
 from server.shading.tone_mapping import AverageMemory, Averages, measure_averages
 from server.shading.traced_scene import DeviceLight, upload_light
@@ -108,10 +108,14 @@ class RenderResult:
     drawing: PendingRead | Picture | None
     layer: Layer | None
     plan: Plan
-    """Without `changes`."""
+    """Without what `told_plan` adds."""
     changes: Changes | None = None
     reference: Picture | None = None
     """At a checkpoint: the virtual things over what the camera saw when the view began."""
+    kept: KeptChanges | None = None
+    """How far off is what the picture has of earlier frames; None: it has nothing virtual."""
+    has_kept_shadows: bool = False
+    """Whether some of its shadows may be of earlier frames."""
 
     def picture(self) -> Picture | None:
         """The picture, waited for."""
@@ -119,7 +123,14 @@ class RenderResult:
 
     def told_plan(self) -> Plan:
         """The plan as it turned out, waited for."""
-        return _with_changes(self.plan, self.changes) if self.changes else self.plan
+        plan = _with_changes(self.plan, self.changes) if self.changes else self.plan
+        if not self.has_kept_shadows:
+            return plan
+        return structs.replace(plan, left_out=(*plan.left_out, shadows_left_out(self.kept_bounds())))
+
+    def kept_bounds(self) -> KeptBounds:
+        """Of what the picture has of earlier frames, waited for."""
+        return self.kept.bounds() if self.kept else NOT_SHOWN
 
 
 @dataclass(frozen=True)
@@ -176,8 +187,12 @@ class Renderer:
         if cached is not None and reuse.reason is not None:
             plan = _reused(cached.plan, spine.left_out, reuse.reason)
             return replace(_composed(context, shown, cached.parts, plan, request), changes=cached.changes)
+        self._engine.state(KeptChanges).begin_frame()
         parts, plan = self._run_effects(context, spine, settings, shown)
         result = _composed(context, shown, parts, plan, request)
+        if spine.objects:
+            has_kept = not context.follows_light and bool(parts.ratio or parts.occluded)
+            result = replace(result, kept=self._engine.state(KeptChanges), has_kept_shadows=has_kept)
         if parts.changed is not None:
             changes = Changes(self._engine.begin_download(parts.changed), has_sharp_shadows=bool(parts.light.discs))
             result = replace(result, changes=changes)
@@ -201,8 +216,6 @@ class Renderer:
         given = _given(context, spine, light, averages, facts)
         effects = make_plan(EFFECTS, PictureParts, given, facts, everything=self._everything, stages=spine.left_out)
         parts, plan = effects.execute(given), effects.described()
-        if not context.follows_light and (parts.ratio or parts.occluded):
-            plan = structs.replace(plan, left_out=(*plan.left_out, SHADOWS_OF_KNOWN_PLACES))
         return parts, plan
 
     def _averages(self, context: FrameContext, spine: SpineOutputs, settings: Settings) -> Averages | None:

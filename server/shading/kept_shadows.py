@@ -17,7 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.messages import LeftOut
 from server.objects.rasterize import Placed
 from server.shading.traced_scene import TracedScene
 from server.transfer.radiance_transfer import Directions
@@ -31,11 +30,6 @@ STEADY = 0.05
 same level: so much of a shadow's depth, in the mean over directions. A solution of the real kitchen moves its light by
 .02; pictures of its frames 20 to 49 differ from those that are traced anew, with four times as many samples of the
 object, by FLIP .0021 with and without kept shadows."""
-SHADOWS_OF_KNOWN_PLACES = LeftOut(
-    effect="shadows_of_known_places",
-    reason=f"kept at the same place, under a light that is the same to {STEADY:.0%}; in view, {LONGEST} frames at most",
-    error_bound=None,
-)
 _REMEMBERED = 80
 """Frames. What was found earlier is found anew when it is seen again."""
 

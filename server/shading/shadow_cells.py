@@ -24,6 +24,7 @@ from server.objects.pixel_boxes import PixelBox
 from server.opencl.buffers import BufferDescription, StageBuffers, Workspace
 from server.opencl.engine import Engine, KernelArgument, float4, int4
 from server.opencl.structs import SHADOW_CELLS
+from server.shading.kept_changes import KeptChanges
 from server.shading.kept_shadows import LONGEST, KeptShadows, ShadowCause
 from server.shading.traced_scene import TracedScene
 from server.transfer.sample_grid import SampleGrid, grid_of
@@ -40,6 +41,9 @@ class ShadowTable(StageBuffers):
 
     close: ClassVar[float]
     """A value that differs by more from the one that was kept is another."""
+
+    is_of_transfer: ClassVar[bool]
+    """Whether values are made of radiance transfer, which is kept, too."""
 
     table = BufferDescription(np.uint32)
     """[places, WORDS] as in kept_shadows.clh."""
@@ -69,6 +73,7 @@ class RealShadows(ShadowTable):
 
     places_a_sample = 4
     close = 0.01
+    is_of_transfer = True
 
 
 class VirtualOcclusions(ShadowTable):
@@ -79,6 +84,7 @@ class VirtualOcclusions(ShadowTable):
 
     places_a_sample = 1
     close = 0.05
+    is_of_transfer = False
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,8 @@ class ShadowCells:
     """[places, WORDS]."""
     asked: cl_array.Array
     found: cl_array.Array
+    changes: cl_array.Array
+    """Of KeptChanges."""
     of: ShadowTable
 
     def arguments(self) -> tuple[KernelArgument, ...]:
@@ -108,6 +116,9 @@ class ShadowCells:
             self.asked,
             self.found,
         )
+        pixels = samples.stride**2 / (camera.width * camera.height)
+        are_all_known = type(self.of).is_of_transfer
+        engine.state(KeptChanges).take(engine, type(self.of), self.changes, pixels, are_all_known=are_all_known)
         self.of.is_whole = True
 
 
@@ -145,7 +156,8 @@ def shadow_cells(
     shape = (samples.rows, samples.cols)
     by_sample = table.asked.array(shape), table.found.array(shape)
     table.is_whole = not fills  # until what was found is kept
-    return ShadowCells(parameters, table.table.array((table.places, WORDS)), *by_sample, table)
+    changes = engine.state(KeptChanges).counts(engine) if fills else engine.unused
+    return ShadowCells(parameters, table.table.array((table.places, WORDS)), *by_sample, changes, table)
 
 
 def no_cells(engine: Engine) -> tuple[KernelArgument, ...]:

@@ -49,11 +49,11 @@ class Indirect:
 
 
 def observe_indirect(
-    engine: Engine, transfer: Transfer, rays: Directions, hits: cl_array.Array, mean: MeanSent
+    engine: Engine, transfer: Transfer, rays: Directions, hits: cl_array.Array, mean: MeanSent, *, is_kept: bool = False
 ) -> Indirect:
     """Indirect light at the samples of `transfer`, from the surfaces that block their directions: the `hits` of
-    `gather_hits`, once all samples have theirs. `mean`: of the session."""
-    return Indirect(hits, mean.update(engine, hits), room_for_met(engine, transfer, rays))
+    `gather_hits`, once all samples have theirs. `mean`: of the session. is_kept: frames to come are drawn with it."""
+    return Indirect(hits, mean.update(engine, hits, waits=is_kept), room_for_met(engine, transfer, rays))
 
 
 def gather_hits(
@@ -125,10 +125,11 @@ class MeanSent:
         self._mean: NDArray[np.float64] = np.zeros(3)
         self._hits: PendingRead | None = None
 
-    def update(self, engine: Engine, hits: cl_array.Array) -> NDArray[np.float64]:
-        """[3] for the picture of `hits`; the first waits for its own mean. 0 before any surface was met."""
+    def update(self, engine: Engine, hits: cl_array.Array, *, waits: bool = False) -> NDArray[np.float64]:
+        """[3] for the picture of `hits`; the first waits for its own mean, and others if they are told to. 0 before any
+        surface was met."""
         last, self._hits = self._hits, engine.begin_download(hits)
-        mean = mean_sent((last or self._hits).result())
+        mean = mean_sent((self._hits if waits or last is None else last).result())
         if mean.any():  # where almost nothing is blocked, whether a surface is met is noise
             self._mean = mean
         return self._mean

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from protocol.messages import LeftOut
 from server.opencl.engine import Engine
+from server.shading.kept_changes import MEASURED, KeptBounds
 from server.transfer.indirect import Indirect, MeanSent, gather_hits, observe_indirect
 from server.transfer.radiance_transfer import Directions, Transfer
 from server.transfer.real_depth_views import RealDepthViews
@@ -85,17 +86,20 @@ class SampledTransfer:
         self._sampler.pass_frame()
         self._has_found = False
 
-    def left_out(self) -> tuple[LeftOut, ...]:
-        """What of the last frame's transfer may have been found instead of traced."""
+    def left_out(self, bounds: KeptBounds) -> tuple[LeftOut, ...]:
+        """What of the last frame's transfer may have been found instead of traced. bounds: of what is drawn with it."""
         if not self._has_found or self._cache is None:
             return ()
         reason = f"kept at the same place of the world; in view, traced again after {LONGEST + ORDERS} frames at most"
-        known = LeftOut(effect="transfer_of_known_places", reason=reason, error_bound=None)
+        bound = bounds.known if self._cache.has_traced_again or not bounds.known else None
+        known = LeftOut(effect="transfer_of_known_places", reason=f"{reason}; {MEASURED}", error_bound=bound)
         share = self._cache.share_waiting()
         if share == 0.0:
             return (known,)
-        waits = f"{share:.1%} of the samples wait for their turn: new ones take the values of one beside them"
-        return known, LeftOut(effect="transfer_of_new_places", reason=waits, error_bound=None)
+        waits = (
+            f"{share:.1%} of the samples wait for their turn: new ones take the values of one beside them; {MEASURED}"
+        )
+        return known, LeftOut(effect="transfer_of_new_places", reason=waits, error_bound=bounds.lent)
 
     def sample(
         self,
@@ -109,16 +113,16 @@ class SampledTransfer:
         is_kept: bool = False,
     ) -> TransferSamples:
         """Transfer of the real world without virtual objects (eq. 5.2). up: [3] unit, world axes. is_kept: frames to
-        come are drawn with it, so that no sample waits for its turn. Nor does one of a session's first frame, most of
-        whose time is the light's anyway: virtual things would stand in a wrong light until the seventh. With samples at
-        all pixels, those beside them are near enough, and all would take a second."""
+        come are drawn with it, so that all samples are traced. No sample waits for its turn in a session's first frame,
+        most of whose time is the light's anyway: virtual things would stand in a wrong light until the seventh. With
+        samples at all pixels, those beside them are near enough, and all would take a second."""
         engine, camera, rays = self._engine, self._camera, self._sampler.rays
-        cache, found = self._cache if self._sampler.is_kept else None, None
+        cache, found = self._cache if self._sampler.is_kept and not is_kept else None, None
         self._has_found = cache is not None
         if cache:
             stride, is_first = self._sampler.sampling.stride, not self._has_begun
             view = camera, volume, surface, volume_from_camera, stride
-            found = cache.find(*view, rays, ray_length_m, traces_all=is_kept or (is_first and stride > 1))
+            found = cache.find(*view, rays, ray_length_m, traces_all=is_first and stride > 1)
         self._has_begun = True
         transfer = self._sampler.transfer(volume, surface, volume_from_camera, up, ray_length_m, found)
         hits = None
@@ -126,5 +130,7 @@ class SampledTransfer:
             hits = gather_hits(engine, camera, volume, surface, transfer, rays, ray_length_m, found=found)
         if cache:  # after it all samples have their values
             transfer = replace(transfer, cells=cache.store())
-        sent = None if hits is None else observe_indirect(engine, transfer, rays, hits, self._mean_sent)
+        sent = (
+            None if hits is None else observe_indirect(engine, transfer, rays, hits, self._mean_sent, is_kept=is_kept)
+        )
         return TransferSamples(transfer, sent)

@@ -14,7 +14,8 @@ frames find or trace them. Old ones that wait stand as they are, ORDERS frames a
 was never seen costs little more than others. A session's first one traces all (samples.py).
 
 So an entry is off by what the scan has changed around it in LONGEST + ORDERS frames at most while it is in view; one
-that comes into view again, by what has changed since it left it, for ORDERS frames.
+that comes into view again, by what has changed since it left it, for ORDERS frames. How far off that makes
+a picture is measured (kept_changes.py). Of a view that comes to rest, all samples are traced (samples.py).
 
 Transfer that is looked up in depth views (image_space.py) is kept likewise, with what the camera's picture adds near a
 point when it is looked up. What of the picture is not in the scan belongs to no place and is left out.
@@ -94,7 +95,7 @@ class TransferCache:
         self._engine = engine
         self._buffers = engine.buffers(_Buffers)
         self._of: tuple[object, ...] = ()
-        self._now = 0
+        self._now = self._begun = 0
         self._frame: _Frame | None = None
         self._is_stored = True
         self._counts: PendingRead | None = None
@@ -181,6 +182,11 @@ class TransferCache:
         self._counts = engine.begin_download(counts)
         return kept
 
+    @property
+    def has_traced_again(self) -> bool:
+        """Whether what it began with was traced again, so that changes since then have shown."""
+        return self._now - self._begun > PERIOD + ORDERS
+
     def store(self) -> Cells:
         """Keep what the samples that `find` left to be traced have now, and give it to those that wait beside them.
         Returns the cells of all samples."""
@@ -231,7 +237,7 @@ class TransferCache:
         asked = (camera, stride, rays.count, rays.interleave, rays.basis.shape[2], ray_length_m)
         if self._of and self._of[0] is volume and self._of[1:] == asked:
             return
-        self._of = (volume, *asked)
+        self._of, self._begun = (volume, *asked), self._now
         engine, buffers = self._engine, self._buffers
         engine.fill(buffers.entries.array((places, words)), 0)
         engine.fill(buffers.claims.array((places,)), _UNCLAIMED)

@@ -11,6 +11,7 @@ from client.gallery.scenes import GALLERY
 from client.options.source import open_source
 from protocol.messages import LeftOut, Plan
 from server.effects.table import effect_names
+from server.shading.kept_changes import MEASURED
 
 
 def test_every_effect_has_a_purpose() -> None:
@@ -25,15 +26,17 @@ def test_a_plan_is_said_an_effect_a_line() -> None:
         LeftOut(effect="light_objects", reason="dark", error_bound=0.5),
         LeftOut(effect="refine_real", reason="asked for", error_bound=255.0),
         LeftOut(effect="lamplight", reason="not drawn", error_bound=None),
+        LeftOut(effect="shadows_of_known_places", reason=f"kept; {MEASURED}", error_bound=11.3),
     )
     text = list(lines("a source, frame 3", Plan(run=("composite",), left_out=left_out)))
-    assert text[0] == "a source, frame 3: 1 effects run, 6 are left out."
+    assert text[0] == "a source, frame 3: 1 effects run, 7 are left out."
     said = {line.split()[0]: line for line in text[2:]}
     assert "puts the picture together" in said["composite"]
     assert said["reflect"].endswith("nothing is glossy (changes nothing)")
     assert said["shadow_real"].endswith("(changes no pixel by more than 0.25/255)")
     assert said["refine_real"].endswith("asked for (change not bounded)")
     assert said["lamplight"].endswith("(change unknown)")
+    assert said["shadows_of_known_places"].endswith("(changes at most one pixel in a thousand by more than 11.30/255)")
     assert "change no pixel by more than 0.75/255" in text[-1]  # one reason counts once
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from unittest.mock import patch
 
 import numpy as np
+import pyopencl.array as cl_array
 import pytest
 from numpy.typing import NDArray
 
@@ -13,13 +14,15 @@ from protocol.frames import CameraModel
 from server.objects.rasterize import Placed, VirtualSurface
 from server.opencl.engine import Engine
 from server.shading.differential_rendering import VIRTUAL_STRIDE, shadow_real, shadow_virtual
+from server.shading.kept_changes import LEAST_CODES, STEPS, KeptChanges
 from server.shading.kept_shadows import LONGEST, STEADY, KeptShadows, ShadowCause, SplitSh, light_differences
 from server.shading.shadow_cells import RealShadows, ShadowCells, VirtualOcclusions, places_for
 from server.shading.traced_scene import TracedScene, trace_scene, upload_light
-from server.transfer.radiance_transfer import Transfer, direction_sets, transfer_radiance
+from server.transfer.radiance_transfer import Cells, Transfer, direction_sets, transfer_radiance
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 from tests.reference.kept_shadows import KeptTable, shadow_cell_of
+from tests.reference.sh import open_transfer
 from tests.scenes import lights
 from tests.scenes.analytic import Floats
 from tests.scenes.shaded_floor import (
@@ -122,10 +125,20 @@ class Stage:
         aside[0, 3] = 0.05
         return self.plate[0], aside @ self.plate[1]
 
-    def ratio(self, light: Floats, eye: Floats | None, objects: list[Placed] | None = None, step: int = 1) -> Floats:
-        """[SIDE, SIDE, 4]."""
-        engine, scene = self.engine, self.scene(light, objects)
-        found = shadow_real(engine, self.camera, self.surface, self.transfer, scene, step=step, eye=eye)
+    def ratio(
+        self,
+        light: Floats,
+        eye: Floats | None,
+        objects: list[Placed] | None = None,
+        step: int = 1,
+        lent: NDArray[np.bool_] | None = None,
+    ) -> Floats:
+        """[SIDE, SIDE, 4]. lent: [SIDE * SIDE] samples with another's transfer."""
+        engine, scene, transfer = self.engine, self.scene(light, objects), self.transfer
+        if lent is not None:
+            places = engine.workspace.upload("places", np.where(lent, -1, 7).astype(np.int32).reshape(SIDE, SIDE))
+            transfer = replace(transfer, cells=Cells(places, places, places, places, 1))
+        found = shadow_real(engine, self.camera, self.surface, transfer, scene, step=step, eye=eye)
         return download4(engine, found.values).astype(float)
 
     def twin(self) -> KeptTable:
@@ -208,6 +221,51 @@ def test_shadows_are_kept_as_by_the_twin(
         shares.append(twin.anew / SIDE**2)
     assert shares[0] == shares[24] == 1
     assert (np.mean(shares[12:20]) < 0.3) == (places_a_sample == 512 and close == 0.1)
+
+
+def counted(changes: list[float]) -> list[int]:
+    """[STEPS] as count_change counts them."""
+    limits = LEAST_CODES * 2.0 ** (np.arange(STEPS) / 2)
+    return [int(n) for n in np.bincount(np.searchsorted(limits[:-1], changes), minlength=STEPS)]
+
+
+def watch(monkeypatch: pytest.MonkeyPatch, of: type) -> list[list[list[int]]]:
+    """What kernels will have counted, frame by frame."""
+    told: list[list[list[int]]] = []
+
+    def take(_self: KeptChanges, _engine: Engine, kind: type, counts: cl_array.Array, *_: float, **__: bool) -> None:
+        assert kind is of
+        told.append(counts.get().tolist())
+
+    monkeypatch.setattr(KeptChanges, "take", take)
+    return told
+
+
+def as_counted(twin: KeptTable) -> list[list[int]]:
+    """[2, 1 + STEPS] of the twin's last frame."""
+    return [[twin.stands, *counted(twin.changes[False])], [twin.lent, *counted(twin.changes[True])]]
+
+
+def test_changes_are_counted_as_by_the_twin(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under a light that moves a little; at first with the transfer of others in half of the cells' samples."""
+    monkeypatch.setattr(RealShadows, "close", 0.1)
+    stage, told = Stage.of(engine), watch(monkeypatch, RealShadows)
+    twin = stage.twin()
+    moved = [LIGHT + share * STEADILY for share in np.linspace(0, 1, 12)]
+
+    expected, late = [], 0
+    for number, light in enumerate(moved):
+        lent = np.arange(SIDE * SIDE) % SIDE < (SIDE // 2 if number < 4 else 0)
+        exact = stage.ratio(light, None)[..., :3].reshape(-1, 3)
+        shown = twin.step(exact, 1, lent=lent)
+        np.testing.assert_allclose(stage.ratio(light, EYE, lent=lent)[..., :3].reshape(-1, 3), shown, atol=3e-6)
+        expected.append(as_counted(twin))
+        late += len(twin.changes[True])
+    assert late > SIDE
+    assert sum(expected[-1][0][1:]) > SIDE
+    apart = np.abs(np.array(told) - expected)
+    assert apart[:, :, 0].max() == 0
+    assert apart.sum() <= 2 * 4  # a change at a limit counts beside it: seen in none
 
 
 def test_shadows_of_a_thing_that_moves_are_found_anew(engine: Engine) -> None:
@@ -305,7 +363,7 @@ class Top:
         points = self.points.reshape(-1, 3).astype(np.float32).astype(float)
         each = zip(points, self.normals.reshape(-1, 3), self.which.ravel(), strict=True)
         cells = [shadow_cell_of(point, normal, int(which), EYE, spacing, places) for point, normal, which in each]
-        return KeptTable(cells, VirtualOcclusions.close, LONGEST)
+        return KeptTable(cells, VirtualOcclusions.close, LONGEST, takes=True)
 
 
 @pytest.mark.parametrize("close", [0.3, VirtualOcclusions.close])
@@ -313,18 +371,25 @@ def test_occlusion_is_kept_as_by_the_twin(engine: Engine, monkeypatch: pytest.Mo
     """Of two objects, with normals of two kinds; relative to the light's level."""
     monkeypatch.setattr(VirtualOcclusions, "close", close)
     top = Top.of(engine)
-    twin, exact = top.twin(), top.taken(LIGHT, None)
+    twin, exact, seen = top.twin(), top.taken(LIGHT, None), 0
     level = np.maximum(0.5 / np.sqrt(np.pi) * LIGHT[0], 0.0).mean()
+    twin.open_ = open_transfer(top.normals.reshape(-1, 3), 4) @ LIGHT / level
     keys = [key for key, _ in twin.cells]
     assert 40 < len(set(keys)) < 300
     assert len({place for _, place in twin.cells}) == len(set(keys))
     assert len({(key, which) for key, which in zip(keys, top.which.ravel(), strict=True)}) == len(set(keys))
+    told = watch(monkeypatch, VirtualOcclusions)
     for number in range(1, 16):
         brightness = 1.0 if number < 8 else 3.0
         expected = level * twin.step(exact[..., :3].reshape(-1, 3) / level, 1)
         found = top.taken(brightness * LIGHT, EYE)
+        apart = np.abs(np.array(told[-1]) - as_counted(twin))
+        assert apart[:, 0].max() == 0
+        assert apart.sum() <= 4
+        seen += sum(told[-1][0][1:])
         np.testing.assert_array_equal(found[..., 3], 1)
         np.testing.assert_allclose(found[..., :3].reshape(-1, 3), brightness * expected, atol=2e-5)
+    assert seen > COUNT
     assert (twin.anew < 0.4 * len(keys)) == (close == 0.3)
 
 

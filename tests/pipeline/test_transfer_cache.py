@@ -11,6 +11,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from client.gallery.play import play, wishes_of
+from client.gallery.scenes import SETTLED_NOISY
 from client.gallery.source import GallerySource
 from client.options.source import open_source
 from client.sources.volume import default_volume, default_voxel
@@ -19,6 +20,7 @@ from server.client_session import ClientSession
 from server.culling.spine import NOT_SHADED
 from server.opencl.device import Device
 from server.pipeline import FrameResult
+from server.reuse.temporal_reuse import NOISE
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
 from server.shading import shadow_cells
@@ -146,6 +148,21 @@ def test_a_thing_that_comes_in_shades_nearly_as_without(device: Device, preset: 
         assert apart.max() <= 18  # seen: 10
         assert (apart > 1).mean() < 0.02  # seen: 0.013
         assert flip_map(cached, exact).mean() < 0.009  # seen: 0.0048
+
+
+@pytest.mark.parametrize("preset", ["reg4", "gr15fast"])
+def test_a_view_at_rest_is_drawn_with_nothing_that_was_kept(device: Device, preset: Preset) -> None:
+    """It is shown as long as it rests. The real ball that came in is in the light of surfaces, too."""
+    source = GallerySource("hand", 160, SETTLED_NOISY + 12)
+    on, off = (
+        [result for _, result in play(device, source, wishes_of(source, cache=cache, preset=preset))]
+        for cache in ("on", "off")
+    )
+    resting = [index for index, result in enumerate(on) if any(left.reason == NOISE for left in result.plan.left_out)]
+    assert len(resting) > 8
+    for index in resting:
+        cached, exact = pictures_of([on[index], off[index]])
+        assert np.abs(cached.astype(int) - exact).max() <= 1
 
 
 @pytest.mark.parametrize(("preset", "codes"), [("reg4", 0), ("art4", 8), ("gr15fast", 6)])  # seen: 0, 4, 3

@@ -443,7 +443,10 @@ export interface LeftOut {
   effect: string;
   /** Why it was not needed, in words. */
   reason: string;
-  /** In display units; null: no bound is known. */
+  /**
+   * In display units; null: no bound is known. Where the reason says that it was measured, it leaves out a thousandth
+   * of the pixels.
+   */
   error_bound: number | null;
 }
 

@@ -196,6 +196,8 @@ class Cached:
     """Share of the time."""
     within: list[float]
     """Share of the pixels within 1/255, of each frame."""
+    held: list[bool | None]
+    """Whether the bounds of each frame hold for all but a thousandth of its pixels; None where it knows none."""
 
 
 def _cached(device: Device, source: GallerySource, everything: list[list[Played]]) -> Cached:
@@ -204,7 +206,14 @@ def _cached(device: Device, source: GallerySource, everything: list[list[Played]
     pairs = [(played(device, source, "needed", "on"), whole) for whole in everything]
     saved = _saved(pairs, range(WARM_UP, len(source)), lambda frame: frame.cpu_ms)
     differences = [np.abs(a.color.astype(int) - b.color).max(axis=-1) for a, b in zip(*pairs[0], strict=True)]
-    return Cached(saved, [float((d <= 1).mean()) for d in differences])
+    held = [_is_held(a.plan, b.plan, d) for (a, b), d in zip(zip(*pairs[0], strict=True), differences, strict=True)]
+    return Cached(saved, [float((d <= 1).mean()) for d in differences], held)
+
+
+def _is_held(plan: Plan, reference: Plan, of_pixels: NDArray[np.int_]) -> bool | None:
+    if any(left.error_bound is None for left in plan.left_out):
+        return None
+    return holds(stated_bound(plan, reference), int(np.quantile(of_pixels, 1 - HARDLY, method="higher")))
 
 
 def _add_at_camera(report: Report, device: Device, say: Callable[[str], None], names: Sequence[str]) -> None:
@@ -229,6 +238,13 @@ def _add_cached(report: Report, what: str, scenes: list[Cached]) -> None:
     report.rows.append(Row(f"{what}: time saved by plan and caches, median", 100 * saved, "%", ">= 40"))
     row = f"{what}: pixels within 1/255 with plan and caches, worst frame, median"
     report.rows.append(Row(row, within, "share", ">= 0.999"))
+    held = [frame for scene in scenes for frame in scene.held]
+    known = [frame for frame in held if frame is not None]
+    row = f"{what}: frames with plan and caches that know their bounds"
+    report.rows.append(Row(row, len(known) / len(held), "share", ""))
+    if known:
+        row = f"{what}: of these, frames whose bounds hold"
+        report.rows.append(Row(row, float(np.mean(known)), "share", ">= 1"))
 
 
 def _add_larger(report: Report, device: Device, say: Callable[[str], None]) -> None:

@@ -26,7 +26,17 @@ from server.opencl.device import Device
 from server.reuse.temporal_reuse import NOISY
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from tests.bench.plan.suite import changed_share, greatest, holds, is_as_known, is_at_rest, stated_bound
+from server.shading.kept_changes import MEASURED
+from tests.bench.plan.suite import (
+    Played,
+    changed_share,
+    greatest,
+    holds,
+    is_as_known,
+    is_at_rest,
+    kept_bounds_hold,
+    stated_bound,
+)
 
 QUICK = (
     "elsewhere",
@@ -170,6 +180,31 @@ def test_bounds_are_those_of_what_the_other_ran() -> None:
     plan = Plan(run=(), left_out=(one, same, other, asked))
     assert stated_bound(plan, Plan(run=("a", "b", "c"), left_out=(asked,))) == 0.75
     assert stated_bound(plan, plan) == 0.0
+
+
+def test_bounds_of_what_is_kept_leave_out_a_thousandth_of_the_pixels() -> None:
+    """Frames without anything kept do not count, nor do those whose bounds are not known."""
+    grey = np.full((20, 100, 3), 90, np.uint8)
+
+    def frame(codes: int, pixels: int, *bounds: float | None) -> Played:
+        color = grey.copy()
+        color.reshape(-1, 3)[:pixels, 1] += np.uint8(codes)
+        left_out = tuple(
+            LeftOut(effect=f"kept_{i}", reason=f"kept; {MEASURED}", error_bound=bound) for i, bound in enumerate(bounds)
+        )
+        asked = LeftOut(effect="bounce", reason="asked for", error_bound=255.0)
+        return Played(color, Plan(run=(), left_out=(*left_out, asked)), 1.0, 1.0)
+
+    cached = [
+        frame(9, 2000),
+        frame(9, 2000, 4.0, None),
+        frame(9, 2, 4.0, 1.0),
+        frame(9, 3, 4.0, 1.0),
+        frame(5, 2000, 4.0, 1.0),
+        frame(6, 2000, 4.0, 1.0),
+        frame(1, 3, 0.0),
+    ]
+    assert kept_bounds_hold(cached, [frame(0, 0)] * len(cached)) == [None, True, False, True, False, False]
 
 
 def test_rounding_may_add_less_than_one() -> None:

@@ -198,7 +198,7 @@ def test_bounds_of_what_is_kept_leave_out_a_thousandth_of_the_pixels() -> None:
     cached = [
         frame(9, 2000),
         frame(9, 2000, 4.0, None),
-        frame(9, 2, 4.0, 1.0),
+        frame(9, 1, 4.0, 1.0),
         frame(9, 3, 4.0, 1.0),
         frame(5, 2000, 4.0, 1.0),
         frame(6, 2000, 4.0, 1.0),

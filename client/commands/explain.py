@@ -78,9 +78,8 @@ def _gallery_plan(source: GallerySource, requested: Wishes, chosen: int, device_
 def lines(title: str, plan: Plan) -> Iterator[str]:
     """A plan as lines, one per effect."""
     unseen = [left for left in plan.left_out if is_unseen(left)]
-    most = sum(
-        bound or 0.0 for _, bound in {(left.reason, left.error_bound) for left in unseen}
-    )  # a reason counts once
+    reasons = {(left.reason, left.error_bound) for left in unseen}  # each counts once
+    most = sum(bound or 0.0 for _, bound in reasons)
     yield f"{title}: {len(plan.run)} effects run, {len(plan.left_out)} are left out."
     width = max(map(len, (*plan.run, *(left.effect for left in plan.left_out))))
     if plan.point is not None:

@@ -3,11 +3,11 @@
 No bound follows from the scene: when a scan changes by a voxel, a narrow view of a lamp may open. So it is measured. In
 view, each value is found anew after LONGEST frames at most, soon after transfer of its place was traced again, if it
 was (transfer_cache.py). What a picture has of either, it has by R' / R and by what occluders take from virtual surface:
-that is compared with what was kept, in codes of the brightest surface that a picture can show, of which darker ones
-change by less. What is about to be found anew is the furthest off, if what changes goes on changing; and samples of one
-cell look in different directions, which counts, too. So what stands is taken to be off as often as what the last
-LONGEST frames found anew. What happens suddenly is not foreseen: a thing that is carried in counts when values around
-it are found anew.
+that is compared with what was kept, in codes of the brightest surface that a picture can show; darker ones change by
+less, and virtual ones by more only where they are shown brighter than white. What is about to be found anew is the
+furthest off, if what changes goes on changing; and samples of one cell look in different directions, which counts, too.
+So what stands is taken to be off as often as what the last LONGEST frames found anew. What happens suddenly is not
+foreseen: a thing that is carried in counts when values around it are found anew.
 """
 
 from __future__ import annotations

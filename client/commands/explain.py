@@ -14,7 +14,7 @@ from protocol.messages import LeftOut, Plan, Wishes
 from server.culling.rules import SHOWN
 from server.opencl.device import open_device
 from server.reuse.temporal_reuse import ECHO, NOISE
-from server.shading.kept_changes import MEASURED
+from server.transfer.kept_bounds import MEASURED
 
 PURPOSES = {
     "rasterize": "draws the virtual objects",

@@ -38,11 +38,12 @@ from server.quality.settings import Settings
 from server.reuse.frame_cache import FrameCache
 from server.reuse.temporal_reuse import ReuseDecision
 from server.shading.composite import CompositeInputs, composite, composite_on_device, shown_picture
-from server.shading.kept_changes import NOT_SHOWN, KeptBounds, KeptChanges, shadows_left_out
+from server.shading.kept_changes import KeptChanges, shadows_left_out
 from server.shading.layer import Layer, compose_layer
 from server.shading.tone_mapping import AverageMemory, Averages, measure_averages
 from server.shading.traced_scene import DeviceLight, upload_light
 from server.transfer.indirect import Indirect
+from server.transfer.kept_bounds import NOT_SHOWN, KeptBounds
 from server.transfer.radiance_transfer import TURNS, Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.samples import TransferSamples

@@ -13,7 +13,6 @@ foreseen: a thing that is carried in counts when values around it are found anew
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 import pyopencl.array as cl_array
@@ -23,29 +22,14 @@ from protocol.messages import LeftOut
 from server.opencl.engine import Engine
 from server.opencl.pending_read import PendingRead
 from server.shading.kept_shadows import LONGEST, STEADY
+from server.transfer.kept_bounds import MEASURED, KeptBounds
 
 STEPS, LEAST_CODES = 21, 0.25
 """The n-th count is of changes of at most LEAST_CODES 2^(n / 2) codes, as in kept_shadows.clh; the last, of all."""
 HARDLY = 0.001
 """Share of the picture's pixels that a bound leaves out, as bounds under noise do (temporal_reuse.py)."""
-MEASURED = "measured where others were found anew, for all but a thousandth of the pixels"
-"""Of a reason whose bound is one of KeptBounds."""
 SHADOWS_OF_KNOWN_PLACES = "shadows_of_known_places"
 _ALL_CODES = 255.0
-
-
-@dataclass(frozen=True)
-class KeptBounds:
-    """In display units (1 is 1/255), for all but a thousandth of the pixels; None: not known yet."""
-
-    known: float | None
-    """Of what stands as it was found earlier."""
-    lent: float | None
-    """Of what was found with the transfer of a sample beside it."""
-
-
-NOT_SHOWN = KeptBounds(0.0, 0.0)
-"""Of a picture that has nothing of it."""
 
 
 class _Kind:

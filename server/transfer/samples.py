@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from protocol.frames import CameraModel
 from protocol.messages import LeftOut
 from server.opencl.engine import Engine
-from server.shading.kept_changes import MEASURED, KeptBounds
 from server.transfer.indirect import Indirect, MeanSent, gather_hits, observe_indirect
+from server.transfer.kept_bounds import MEASURED, KeptBounds
 from server.transfer.radiance_transfer import Directions, Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.sampling import Sampling, TransferSampler

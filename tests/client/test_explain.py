@@ -11,7 +11,7 @@ from client.gallery.scenes import GALLERY
 from client.options.source import open_source
 from protocol.messages import LeftOut, Plan
 from server.effects.table import effect_names
-from server.shading.kept_changes import MEASURED
+from server.transfer.kept_bounds import MEASURED
 
 
 def test_every_effect_has_a_purpose() -> None:

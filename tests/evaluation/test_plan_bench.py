@@ -26,7 +26,7 @@ from server.opencl.device import Device
 from server.reuse.temporal_reuse import NOISY
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from server.shading.kept_changes import MEASURED
+from server.transfer.kept_bounds import MEASURED
 from tests.bench.plan.suite import (
     Played,
     changed_share,

@@ -11,8 +11,9 @@ from protocol.messages import Preset
 from server.opencl.device import Device
 from server.opencl.engine import Engine
 from server.pipeline import FrameResult
-from server.shading.kept_changes import HARDLY, LEAST_CODES, STEPS, KeptBounds, KeptChanges, bound_of
+from server.shading.kept_changes import HARDLY, LEAST_CODES, STEPS, KeptChanges, bound_of
 from server.shading.kept_shadows import LONGEST
+from server.transfer.kept_bounds import KeptBounds
 from server.transfer.transfer_cache import ORDERS, PERIOD
 from tests.scenes.analytic import Floats
 

@@ -28,7 +28,7 @@ from client.gallery.source import GallerySource
 from protocol.messages import Plan
 from server.culling.spine import GIVEN_LIGHT
 from server.opencl.device import Device, open_device
-from server.shading.kept_changes import MEASURED
+from server.transfer.kept_bounds import MEASURED
 from tests.bench.rendering.flip import flip_map
 from tests.bench.rendering.speed import EVERYTHING as WHOLE_STAGE
 from tests.bench.rendering.speed import StageClock, clocked

@@ -22,7 +22,7 @@ from protocol.messages import LeftOut
 from server.opencl.engine import Engine
 from server.opencl.pending_read import PendingRead
 from server.shading.kept_shadows import LONGEST, STEADY
-from server.transfer.kept_bounds import MEASURED, KeptBounds
+from server.transfer.kept_bounds import KeptBounds, kept_left_out
 
 STEPS, LEAST_CODES = 21, 0.25
 """The n-th count is of changes of at most LEAST_CODES 2^(n / 2) codes, as in kept_shadows.clh; the last, of all."""
@@ -92,7 +92,7 @@ class KeptChanges:
 def shadows_left_out(bounds: KeptBounds) -> LeftOut:
     """Shadows that are shown as an earlier frame found them."""
     kept = f"kept at the same place, under a light that is the same to {STEADY:.0%}; in view, {LONGEST} frames at most"
-    return LeftOut(effect=SHADOWS_OF_KNOWN_PLACES, reason=f"{kept}; {MEASURED}", error_bound=bounds.known)
+    return kept_left_out(SHADOWS_OF_KNOWN_PLACES, kept, bounds.known)
 
 
 def bound_of(shown: NDArray[np.float64], changes: NDArray[np.int64]) -> float | None:

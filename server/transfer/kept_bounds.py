@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from protocol.messages import LeftOut
+
 MEASURED = "measured where others were found anew, for all but a thousandth of the pixels"
-"""Of a reason whose bound is one of KeptBounds."""
+NOT_YET = "how far off that is will be known when enough was found anew"
+"""Ends of the reason of what is kept, with a bound and without."""
 
 
 @dataclass(frozen=True)
@@ -20,3 +23,8 @@ class KeptBounds:
 
 NOT_SHOWN = KeptBounds(0.0, 0.0)
 """Of a picture that has nothing of it."""
+
+
+def kept_left_out(effect: str, reason: str, bound: float | None) -> LeftOut:
+    """What is not made anew, and how far off it may be."""
+    return LeftOut(effect=effect, reason=f"{reason}; {NOT_YET if bound is None else MEASURED}", error_bound=bound)

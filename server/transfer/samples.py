@@ -11,7 +11,7 @@ from protocol.frames import CameraModel
 from protocol.messages import LeftOut
 from server.opencl.engine import Engine
 from server.transfer.indirect import Indirect, MeanSent, gather_hits, observe_indirect
-from server.transfer.kept_bounds import MEASURED, KeptBounds
+from server.transfer.kept_bounds import KeptBounds, kept_left_out
 from server.transfer.radiance_transfer import Directions, Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.sampling import Sampling, TransferSampler
@@ -92,14 +92,12 @@ class SampledTransfer:
             return ()
         reason = f"kept at the same place of the world; in view, traced again after {LONGEST + ORDERS} frames at most"
         bound = bounds.known if self._cache.has_traced_again or not bounds.known else None
-        known = LeftOut(effect="transfer_of_known_places", reason=f"{reason}; {MEASURED}", error_bound=bound)
+        known = kept_left_out("transfer_of_known_places", reason, bound)
         share = self._cache.share_waiting()
         if share == 0.0:
             return (known,)
-        waits = (
-            f"{share:.1%} of the samples wait for their turn: new ones take the values of one beside them; {MEASURED}"
-        )
-        return known, LeftOut(effect="transfer_of_new_places", reason=waits, error_bound=bounds.lent)
+        waits = f"{share:.1%} of the samples wait for their turn: new ones take the values of one beside them"
+        return known, kept_left_out("transfer_of_new_places", waits, bounds.lent)
 
     def sample(
         self,

@@ -26,7 +26,7 @@ from server.opencl.device import Device
 from server.reuse.temporal_reuse import NOISY
 from server.scene.mesh import load_mesh
 from server.scene.placement import Placement
-from server.transfer.kept_bounds import MEASURED
+from server.transfer.kept_bounds import kept_left_out
 from tests.bench.plan.suite import (
     Played,
     changed_share,
@@ -189,9 +189,7 @@ def test_bounds_of_what_is_kept_leave_out_a_thousandth_of_the_pixels() -> None:
     def frame(codes: int, pixels: int, *bounds: float | None) -> Played:
         color = grey.copy()
         color.reshape(-1, 3)[:pixels, 1] += np.uint8(codes)
-        left_out = tuple(
-            LeftOut(effect=f"kept_{i}", reason=f"kept; {MEASURED}", error_bound=bound) for i, bound in enumerate(bounds)
-        )
+        left_out = tuple(kept_left_out(f"kept_{i}", "kept", bound) for i, bound in enumerate(bounds))
         asked = LeftOut(effect="bounce", reason="asked for", error_bound=255.0)
         return Played(color, Plan(run=(), left_out=(*left_out, asked)), 1.0, 1.0)
 

@@ -13,7 +13,7 @@ from server.opencl.engine import Engine
 from server.pipeline import FrameResult
 from server.shading.kept_changes import HARDLY, LEAST_CODES, STEPS, KeptChanges, bound_of
 from server.shading.kept_shadows import LONGEST
-from server.transfer.kept_bounds import KeptBounds
+from server.transfer.kept_bounds import MEASURED, NOT_YET, KeptBounds
 from server.transfer.transfer_cache import ORDERS, PERIOD
 from tests.scenes.analytic import Floats
 
@@ -108,7 +108,9 @@ AGAIN = PERIOD + ORDERS
 
 def kept_bounds(result: FrameResult) -> dict[str, float | None]:
     """By the name of what is kept."""
-    return {left.effect: left.error_bound for left in result.plan.left_out if left.effect.endswith("_of_known_places")}
+    kept = [left for left in result.plan.left_out if left.effect.endswith("_of_known_places")]
+    assert all(left.reason.endswith(NOT_YET if left.error_bound is None else MEASURED) for left in kept)
+    return {left.effect: left.error_bound for left in kept}
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from client.gallery.source import GallerySource
 from protocol.messages import Plan
 from server.culling.spine import GIVEN_LIGHT
 from server.opencl.device import Device, open_device
-from server.transfer.kept_bounds import MEASURED
+from server.transfer.kept_bounds import MEASURED, NOT_YET
 from tests.bench.rendering.flip import flip_map
 from tests.bench.rendering.speed import EVERYTHING as WHOLE_STAGE
 from tests.bench.rendering.speed import StageClock, clocked
@@ -216,7 +216,7 @@ def kept_bounds_hold(cached: Sequence[Played], exact: Sequence[Played]) -> list[
     of the pixels, of frames with nothing kept; None where a bound is not known yet."""
     held: list[bool | None] = []
     for a, b in zip(cached, exact, strict=True):
-        bounds = [left.error_bound for left in a.plan.left_out if left.reason.endswith(MEASURED)]
+        bounds = [left.error_bound for left in a.plan.left_out if left.reason.endswith((MEASURED, NOT_YET))]
         known = [bound for bound in bounds if bound is not None]
         apart = np.abs(a.color.astype(int) - b.color).max(axis=-1)
         most = int(np.quantile(apart, 1 - HARDLY, method="higher"))

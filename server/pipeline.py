@@ -29,6 +29,7 @@ from server.room.frame_view import frame_view, surface_on_ray
 from server.room.room import Room
 from server.room.spots import SpotView
 from server.shading.composite import shown_picture
+from server.shading.kept_changes import KeptChanges
 from server.shading.layer import NOTHING, Layer
 from server.shading.touched_discs import without_touched
 from server.shading.traced_scene import middles_of
@@ -307,11 +308,8 @@ class Pipeline:
         timings = self._timings()
         self._frames += 1
         self._room.changes += 1
-        others = (
-            (*self._transfer.left_out(rendered.kept_bounds()), *self._room.lamps.left_out())
-            if geometry.tracking != "lost"
-            else ()
-        )
+        kept = self._transfer.left_out(self._engine.state(KeptChanges).bounds())
+        others = (*kept, *self._room.lamps.left_out()) if geometry.tracking != "lost" else ()
         return FrameResult(
             color=picture,
             layer=rendered.layer,

@@ -43,7 +43,6 @@ from server.shading.layer import Layer, compose_layer
 from server.shading.tone_mapping import AverageMemory, Averages, measure_averages
 from server.shading.traced_scene import DeviceLight, upload_light
 from server.transfer.indirect import Indirect
-from server.transfer.kept_bounds import NOT_SHOWN, KeptBounds
 from server.transfer.radiance_transfer import TURNS, Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.samples import TransferSamples
@@ -114,9 +113,7 @@ class RenderResult:
     reference: Picture | None = None
     """At a checkpoint: the virtual things over what the camera saw when the view began."""
     kept: KeptChanges | None = None
-    """How far off is what the picture has of earlier frames; None: it has nothing virtual."""
-    has_kept_shadows: bool = False
-    """Whether some of its shadows may be of earlier frames."""
+    """How far off are shadows of earlier frames; None: it has none."""
 
     def picture(self) -> Picture | None:
         """The picture, waited for."""
@@ -125,13 +122,9 @@ class RenderResult:
     def told_plan(self) -> Plan:
         """The plan as it turned out, waited for."""
         plan = _with_changes(self.plan, self.changes) if self.changes else self.plan
-        if not self.has_kept_shadows:
+        if self.kept is None:
             return plan
-        return structs.replace(plan, left_out=(*plan.left_out, shadows_left_out(self.kept_bounds())))
-
-    def kept_bounds(self) -> KeptBounds:
-        """Of what the picture has of earlier frames, waited for."""
-        return self.kept.bounds() if self.kept else NOT_SHOWN
+        return structs.replace(plan, left_out=(*plan.left_out, shadows_left_out(self.kept.bounds())))
 
 
 @dataclass(frozen=True)
@@ -188,12 +181,12 @@ class Renderer:
         if cached is not None and reuse.reason is not None:
             plan = _reused(cached.plan, spine.left_out, reuse.reason)
             return replace(_composed(context, shown, cached.parts, plan, request), changes=cached.changes)
-        self._engine.state(KeptChanges).begin_frame()
+        kept = self._engine.state(KeptChanges)
+        kept.begin_frame()
         parts, plan = self._run_effects(context, spine, settings, shown)
         result = _composed(context, shown, parts, plan, request)
-        if spine.objects:
-            has_kept = not context.follows_light and bool(parts.ratio or parts.occluded)
-            result = replace(result, kept=self._engine.state(KeptChanges), has_kept_shadows=has_kept)
+        if not context.follows_light and (parts.ratio or parts.occluded):
+            result = replace(result, kept=kept)
         if parts.changed is not None:
             changes = Changes(self._engine.begin_download(parts.changed), has_sharp_shadows=bool(parts.light.discs))
             result = replace(result, changes=changes)

@@ -21,10 +21,6 @@ class KeptBounds:
     """Of what was found with the transfer of a sample beside it."""
 
 
-NOT_SHOWN = KeptBounds(0.0, 0.0)
-"""Of a picture that has nothing of it."""
-
-
 def kept_left_out(effect: str, reason: str, bound: float | None) -> LeftOut:
     """What is not made anew, and how far off it may be."""
     return LeftOut(effect=effect, reason=f"{reason}; {NOT_YET if bound is None else MEASURED}", error_bound=bound)

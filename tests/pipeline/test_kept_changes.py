@@ -137,9 +137,3 @@ def test_pictures_are_off_by_no_more_than_the_plan_says(device: Device, name: st
         if None not in each.values():
             apart = np.abs(cached.color.astype(int) - exact.color).max(axis=-1)
             assert np.quantile(apart, 1 - HARDLY, method="higher") < sum(each.values()) + 1  # type: ignore[arg-type]
-
-
-def test_nothing_virtual_shows_nothing_of_what_is_kept(device: Device) -> None:
-    source = GallerySource("nothing", 160)
-    for _, result in play(device, source, wishes_of(source, cache="on")):
-        assert set(kept_bounds(result).values()) <= {0.0}

@@ -28,6 +28,7 @@ from client.gallery.source import GallerySource
 from protocol.messages import Plan
 from server.culling.spine import GIVEN_LIGHT
 from server.opencl.device import Device, open_device
+from server.shading.kept_changes import HARDLY
 from server.transfer.kept_bounds import MEASURED, NOT_YET
 from tests.bench.rendering.flip import flip_map
 from tests.bench.rendering.speed import EVERYTHING as WHOLE_STAGE
@@ -42,8 +43,6 @@ CAMERA_WIDTH, CAMERA_FRAMES = 640, 24
 QUICK_AT_CAMERA = ("closed-room", "soft-sky", "sharp-sun")
 KEPT_FRAMES = 60
 """Frames of which the last half tells how far off what is kept may be."""
-HARDLY = 0.001
-"""Share of the pixels that bounds of noise leave out."""
 HELD = frozenset({"composite"})
 """Effects of a frame whose virtual things are held."""
 WARM_UP = 2

@@ -223,6 +223,7 @@ class Pipeline:
             context.ray_length_m,
             with_indirect=self._settings.indirect != "none",
             is_kept=reuse.reason is not None,
+            renews=reuse.renews_transfer,
         )
         if reuse.reason is not None:
             self._cache.keep(samples, reuse.samples_version, frozenset({"cells"}))

@@ -13,6 +13,7 @@
 #include "samples.clh"
 #include "shadows.clh"
 #include "sharers.clh"
+#include "ways.clh"
 
 // What the discs of the light bring to the samples [rows][cols], without and with objects (light_samples of shadow_map.cl), and
 // the least shading that counts, see direct_mix.clh. has_discs: 0: the light has none.
@@ -44,10 +45,10 @@ static void write_block(const Grid grid, global const float4 *positions, global 
 // SHARERS items a block of `step` x `step` samples, which get the ratio of the first of them, or none where that has no surface.
 // whole, whole_shaded [rows][cols]: ratio and R with what the discs bring, written if has_discs.
 // Samples whose cell keeps a ratio get that one. Of the others, if `asking`, each asks to fill its cell -> asked [rows][cols], found
-// [rows][cols]: the cell's value then; changes: see count_change. own_cells [rows][cols] of store_samples of transfer_cache.cl, if
-// has_cells: -1 where a sample has the transfer of another.
+// [rows][cols]: the cell's value then; changes: see count_change. ways [rows][cols], if has_ways: how samples came to
+// their transfer (ways.clh); where it was traced in this frame, what was kept is not used.
 kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, global const float *transfer, global const float4 *hits,
-                        DISC_SAMPLES, SHADOW_CELLS, const int asking, const int has_cells, global const int *own_cells, global int4 *asked,
+                        DISC_SAMPLES, SHADOW_CELLS, const int asking, const int has_ways, global const uchar *ways, global int4 *asked,
                         global float4 *found, global int *changes, global float4 *ratio, global float4 *shaded, global float4 *whole,
                         global float4 *whole_shaded) {
     SHARED_PARTS
@@ -61,7 +62,9 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
     const int is_known = is_inside && position.w > 0.0f && normal.w > 0.0f;
     const int place = place_near(scene.light.table, light_table, position.xyz);
     const Arriving arrives = ARRIVING_UNCHANGED(place);
+    const int way = has_ways ? ways[sample] : AS_KEPT;
     ShadowCell cell = find_shadow(cells, table, position, normal.xyz, -1);
+    cell.is_kept &= way != ANEW;
     float4 own_part = (float4)(0.0f);
     if (is_known && !cell.is_kept) {
         const Volume volume = SOLIDS_OF_SCENE;
@@ -82,7 +85,7 @@ kernel void shadow_real(REAL_SCENE_PARAMETERS, SAMPLE_BUFFERS, const int step, g
         without = shading_without(arrives, without, openness[sample], hits[sample]);
         const float3 floor = LEAST_SHADING * 0.28209479f * light[0].xyz + 1e-9f;
         const float3 own = fmax(without - taken, floor) / fmax(without, floor);
-        const int is_lent = has_cells && own_cells[sample] < 0;
+        const int is_lent = way == OF_ANOTHER;
         of_ratio = (float4)(cell.is_kept ? cell.value.xyz : with_found(cells, cell, own, sample, is_lent, &number), 1.0f);
         if (asking) found[sample] = of_ratio;
         if (asking) count_change(cell, cell.value.xyz, own, (float3)(1.0f), is_lent, changes);

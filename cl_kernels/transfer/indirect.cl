@@ -1,9 +1,9 @@
 // Indirect light from photographed surfaces: the colour in the volume where a blocked direction of a sample ends.
 // Provides gather_hits.
+#include "meeting.clh"
 #include "met.clh"
 #include "samples.clh"
 #include "surface_color.clh"
-#include "visibility.clh"
 
 #ifndef MASK_WORDS
 #error MASK_WORDS must be defined: 32-bit words that hold one bit a direction
@@ -49,18 +49,13 @@ kernel void gather_hits(const GatherParameters p, global const float4 *positions
             }
             if (waiting == 0 || (waiting < LANES && j < count - 1)) continue;
             for (int lane = waiting; lane < LANES; lane++) chosen[lane] = chosen[0];
-            const Rays rays = volume_rays(volume, origin_m, directions, chosen);
-            floatn begin, end;
-            clip_rays(volume, rays, &begin, &end);
-            end = fmin(end, p.ray_length_m / volume.voxel_m);
-            const floatn t = find_solid_voxels(volume, rays, begin, end);
-            float distance[LANES];
-            STORE_LANES(t < end ? t : -1.0f, distance);
+            float distance_m[LANES];
+            meet(volume, origin_m, directions, chosen, p.ray_length_m, distance_m);
             for (int lane = 0; lane < waiting; lane++) {
-                if (distance[lane] < 0.0f) continue;
-                met[sample * p.most + count_met++] = pack_met(number[lane], distance[lane] * volume.voxel_m);
+                if (distance_m[lane] < 0.0f) continue;
+                met[sample * p.most + count_met++] = pack_met(number[lane], distance_m[lane]);
                 const float3 direction = directions[chosen[lane]].xyz;
-                const float4 color = color_at(volume, colors, origin_m / volume.voxel_m + distance[lane] * direction);
+                const float4 color = color_at(volume, colors, (origin_m + distance_m[lane] * direction) / volume.voxel_m);
                 sum += color.w * dot(normal.xyz, direction) * (float4)(color.xyz, 1.0f);
             }
             waiting = 0;

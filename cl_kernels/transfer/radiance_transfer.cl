@@ -27,7 +27,7 @@
 // surface), flatness [rows][cols]: fraction of the window on the sample's own surface, free_mask [rows][cols][MASK_WORDS]: bit j =
 // direction j lies above the surface and is free, sets [rows][cols][INTERLEAVE]: direction j is that of set sets[j % INTERLEAVE].
 // With IS_CHOSEN only the samples `chosen` [chosen_count] are computed, one item each; the others keep their values. With HAS_CACHE
-// those that are `found` (transfer_cache.cl) keep theirs.
+// those that are `found` (transfer_cache.cl) keep theirs; -> mean_normals [rows][cols]: of the others, w = flatness.
 kernel void transfer_radiance(const TransferParameters parameters, global const float4 *positions, global const float4 *normals,
                               global const uchar *labels, global const int *slots, global const ulong *solid, global const uchar *octets,
                               global const float4 *directions, global const float *basis, global const float16 *cameras,
@@ -41,7 +41,7 @@ kernel void transfer_radiance(const TransferParameters parameters, global const 
                               , global const int *chosen
 #endif
 #ifdef HAS_CACHE
-                              , global const int *found
+                              , global const int *found, global float4 *mean_normals
 #endif
 ) {
     const Grid grid = parameters.grid;
@@ -131,5 +131,8 @@ kernel void transfer_radiance(const TransferParameters parameters, global const 
     for (int i = 0; i < MASK_WORDS; i++) free_mask[sample * MASK_WORDS + i] = mask[i];
     for (int i = 0; i < INTERLEAVE; i++) sets[sample * INTERLEAVE + i] = set[i];
     flatness[sample] = normal.w;
+#ifdef HAS_CACHE
+    mean_normals[sample] = normal;
+#endif
     openness[sample] = valid && sky > 0.0f ? 1.0f - blocked_sky / sky : -1.0f;
 }

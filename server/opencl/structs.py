@@ -168,13 +168,21 @@ TRANSFER_CACHE_PARAMETERS = Struct(
     eye="float4",
     spacing="float",
     now="int",
+    renews="int",
     period="int",
-    longest="int",
+    checks="int",
+    parts="int",
+    count="int",
+    met="int",
+    ray_length_m="float",
     places="int",
     most="int",
 )
 """Parameters of transfer_cache.cl. eye: where the camera is, volume metres; spacing: metres between samples that are a
-metre away; most: samples that a frame traces."""
+metre away; now: this frame's number; renews: every entry is traced again; period: frames after which one is in any
+case; checks: those after which it is checked again, 0: never; parts: of the `count` directions of a sample, of which a
+check traces one; met: of its directions whose surface is known, how many a check traces at most; places: of the table;
+most: samples that a frame traces."""
 
 SHADOW_CELLS = Struct(
     "ShadowCells",

@@ -95,6 +95,8 @@ class ReuseDecision:
     """Version of the values that this frame caches or finds."""
     is_checkpoint: bool = False
     """Whether this frame's picture is compared to see whether the view has settled."""
+    renews_transfer: bool = False
+    """Whether all transfer is found anew, so that what is kept of a scene that moved before changes no more."""
     echo: CullReason | None = None
     """Frames that the light has not used yet, while their effect can still be seen."""
 
@@ -157,6 +159,7 @@ class TemporalReuse:
             keeps_geometry=keeps_geometry,
             version=Version(self._view, self._objects, count % period),
             is_checkpoint=self._reason is None and count % period == 0,
+            renews_transfer=self._may_settle() and count == TURNS,
             echo=CullReason(ECHO, ALLOWANCE) if self._echo_frames else None,
         )
 
@@ -184,6 +187,10 @@ class TemporalReuse:
         if self._reason is None and count >= MOST_FRAMES:
             self._changes.forget()
             self._begin_view()
+
+    def _may_settle(self) -> bool:
+        """Whether frames differ by noise, and the view does not rest yet, but can."""
+        return self._reason is None and not self._changes.is_exact and not self._is_tracked
 
     def _begin_view(self) -> None:
         if self._reason is not None and (np.array(self._lights) != self._lights[-1]).any():

@@ -116,7 +116,7 @@ def shadow_real(
         *(cells.arguments() if cells else no_cells(engine)),
         cells is not None and step == 1,
         transfer.cells is not None,
-        transfer.cells.places if transfer.cells else engine.unused,
+        transfer.cells.ways if transfer.cells else engine.unused,
         *((cells.asked, cells.found, cells.changes) if cells else (engine.unused,) * 3),
         ratio,
         shaded,

@@ -52,6 +52,7 @@ class TransferBuffers(StageBuffers):
     openness = KeyedBufferDescription(np.float32)
     flatness = KeyedBufferDescription(np.float32)
     free_mask = KeyedBufferDescription(np.uint32)
+    mean_normals = KeyedBufferDescription(cl_types.float4)
     sets = KeyedBufferDescription(np.uint8)
     own_sets = KeyedBufferDescription(np.uint8)
     """[rows, cols, 1] of own_sets, by turn, rows and columns."""
@@ -111,6 +112,8 @@ class Cells:
 
     places: cl_array.Array
     """[rows, cols] int32: place of each sample's cell, -1 without one."""
+    ways: cl_array.Array
+    """[rows, cols] uint8: how it came to its transfer, see ways.clh."""
     claims: cl_array.Array
     """[cells] uint32: UINT_MAX but while a kernel decides which sample fills a cell."""
     disc_parts: cl_array.Array
@@ -184,7 +187,7 @@ def transfer_radiance(
         only = (*only, buffers.chosen[rows, cols].upload(np.resize(chosen, rows * cols)))
     if found is not None:
         defines["HAS_CACHE"] = 1
-        only = (*only, found)
+        only = (*only, found, room_for_mean_normals(engine, result))
     engine.launch(
         engine.kernel("radiance_transfer.cl", "transfer_radiance", **defines),
         (cols, rows) if chosen is None else (len(chosen),),
@@ -240,6 +243,13 @@ def room_for_transfer(
         buffers.free_mask[size].array((rows, cols, -(-rays.count // 32))),
         sets,
     )
+
+
+def room_for_mean_normals(engine: Engine, transfer: Transfer) -> cl_array.Array:
+    """The array [rows, cols] float4 that `transfer_radiance` fills at the samples that are not found: the mean normal
+    that rays rise from, and the flatness."""
+    size = (transfer.rows, transfer.cols)
+    return engine.buffers(TransferBuffers).mean_normals[size].array(size)
 
 
 def window_arguments(camera: CameraModel, surface: Surface, stride: int) -> tuple[KernelArgument, ...]:

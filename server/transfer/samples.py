@@ -15,7 +15,7 @@ from server.transfer.kept_bounds import KeptBounds, kept_left_out
 from server.transfer.radiance_transfer import Directions, Transfer
 from server.transfer.real_depth_views import RealDepthViews
 from server.transfer.sampling import Sampling, TransferSampler
-from server.transfer.transfer_cache import LONGEST, ORDERS, TransferCache
+from server.transfer.transfer_cache import CHECKS, ORDERS, PARTS, PERIOD_OF_VIEWS, TransferCache
 from server.volume.raycast import Surface
 from server.volume.volume import Volume
 
@@ -90,8 +90,11 @@ class SampledTransfer:
         """What of the last frame's transfer may have been found instead of traced. bounds: of what is drawn with it."""
         if not self._has_found or self._cache is None:
             return ()
-        reason = f"kept at the same place of the world; in view, traced again after {LONGEST + ORDERS} frames at most"
-        bound = bounds.known if self._cache.has_traced_again or not bounds.known else None
+        looks = f"looked up again after {PERIOD_OF_VIEWS + ORDERS} frames at most"
+        if self._sampler.depth_views is None:
+            looks = f"all its rays are traced again in {CHECKS * PARTS} frames, to see whether they changed"
+        reason = f"kept at the same place of the world; in view, {looks}"
+        bound = bounds.known if self._cache.has_looked_again or not bounds.known else None
         known = kept_left_out("transfer_of_known_places", reason, bound)
         share = self._cache.share_waiting()
         if share == 0.0:
@@ -109,18 +112,29 @@ class SampledTransfer:
         *,
         with_indirect: bool,
         is_kept: bool = False,
+        renews: bool = False,
     ) -> TransferSamples:
         """Transfer of the real world without virtual objects (eq. 5.2). up: [3] unit, world axes. is_kept: frames to
-        come are drawn with it, so that all samples are traced. No sample waits for its turn in a session's first frame,
-        most of whose time is the light's anyway: virtual things would stand in a wrong light until the seventh. With
-        samples at all pixels, those beside them are near enough, and all would take a second."""
+        come are drawn with it, so that all samples are traced; renews: what was kept is found anew, too. No sample
+        waits for its turn in a session's first frame, most of whose time is the light's anyway: virtual things would
+        stand in a wrong light until the seventh. With samples at all pixels, those beside them are near enough, and all
+        would take a second."""
         engine, camera, rays = self._engine, self._camera, self._sampler.rays
         cache, found = self._cache if self._sampler.is_kept and not is_kept else None, None
         self._has_found = cache is not None
         if cache:
+            is_traced = not self._sampler.sampling.image_space
             stride, is_first = self._sampler.sampling.stride, not self._has_begun
             view = camera, volume, surface, volume_from_camera, stride
-            found = cache.find(*view, rays, ray_length_m, traces_all=is_first and stride > 1)
+            found = cache.find(
+                *view,
+                rays,
+                ray_length_m,
+                is_traced=is_traced,
+                with_hits=with_indirect,
+                traces_all=renews or (is_first and stride > 1),
+                renews=renews,
+            )
         self._has_begun = True
         transfer = self._sampler.transfer(volume, surface, volume_from_camera, up, ray_length_m, found)
         hits = None

@@ -44,6 +44,7 @@ def shared_cells(engine: Engine, now: int) -> Cells:
     space, count = engine.workspace, SIDE * SIDE // 2
     return Cells(
         space.upload("places", places),
+        space.upload("ways", np.zeros(places.shape, np.uint8)),
         space.upload("claims", np.full(count, NOBODY, np.uint32)),
         space.upload("kept_parts", float4(np.full((count, 3), 0.25))),
         space.upload("kept_frames", np.zeros(count, np.int32)),

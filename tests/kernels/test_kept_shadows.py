@@ -41,6 +41,10 @@ from tests.scenes.shaded_floor import (
 from tests.scenes.solids import box, download4, fill_volume, float4, floor, upload_surface
 
 SIDE = 24
+AS_KEPT, ANEW, OF_ANOTHER = 0, 1, 2
+"""As in ways.clh."""
+TRACED_IN = 10
+"""A frame in which two thirds of the samples trace their transfer anew."""
 EYE = np.array([0.48, 1.3, 0.9])
 RAYS = direction_sets(81, 4)
 STEADILY = 0.5 * STEADY * np.linalg.norm(LIGHT) * np.eye(16, 3, -3) / np.sqrt(3)
@@ -131,13 +135,13 @@ class Stage:
         eye: Floats | None,
         objects: list[Placed] | None = None,
         step: int = 1,
-        lent: NDArray[np.bool_] | None = None,
+        ways: NDArray[np.uint8] | None = None,
     ) -> Floats:
-        """[SIDE, SIDE, 4]. lent: [SIDE * SIDE] samples with another's transfer."""
+        """[SIDE, SIDE, 4]. ways: [SIDE * SIDE] how samples came to their transfer."""
         engine, scene, transfer = self.engine, self.scene(light, objects), self.transfer
-        if lent is not None:
-            places = engine.workspace.upload("places", np.where(lent, -1, 7).astype(np.int32).reshape(SIDE, SIDE))
-            transfer = replace(transfer, cells=Cells(places, places, places, places, 1))
+        if ways is not None:
+            told = engine.workspace.upload("ways", ways.reshape(SIDE, SIDE))
+            transfer = replace(transfer, cells=Cells(told, told, told, told, told, 1))
         found = shadow_real(engine, self.camera, self.surface, transfer, scene, step=step, eye=eye)
         return download4(engine, found.values).astype(float)
 
@@ -247,21 +251,26 @@ def as_counted(twin: KeptTable) -> list[list[int]]:
 
 
 def test_changes_are_counted_as_by_the_twin(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Under a light that moves a little; at first with the transfer of others in half of the cells' samples."""
+    """Under a light that moves a little; at first with the transfer of others in half of the cells' samples, later with
+    transfer that some trace anew: what was kept for them is found anew, too."""
     monkeypatch.setattr(RealShadows, "close", 0.1)
     stage, told = Stage.of(engine), watch(monkeypatch, RealShadows)
     twin = stage.twin()
     moved = [LIGHT + share * STEADILY for share in np.linspace(0, 1, 12)]
 
-    expected, late = [], 0
+    expected, late, stood = [], 0, []
     for number, light in enumerate(moved):
         lent = np.arange(SIDE * SIDE) % SIDE < (SIDE // 2 if number < 4 else 0)
+        traced = np.arange(SIDE * SIDE) % SIDE >= (SIDE // 3 if number == TRACED_IN else SIDE)
+        ways = np.select([lent, traced], [OF_ANOTHER, ANEW], AS_KEPT).astype(np.uint8)
         exact = stage.ratio(light, None)[..., :3].reshape(-1, 3)
-        shown = twin.step(exact, 1, lent=lent)
-        np.testing.assert_allclose(stage.ratio(light, EYE, lent=lent)[..., :3].reshape(-1, 3), shown, atol=3e-6)
+        shown = twin.step(exact, 1, lent=lent, traced=traced)
+        np.testing.assert_allclose(stage.ratio(light, EYE, ways=ways)[..., :3].reshape(-1, 3), shown, atol=3e-6)
         expected.append(as_counted(twin))
         late += len(twin.changes[True])
+        stood.append(twin.stands)
     assert late > SIDE
+    assert 0 < stood[TRACED_IN] <= SIDE * SIDE // 3 < stood[TRACED_IN - 1]
     assert sum(expected[-1][0][1:]) > SIDE
     apart = np.abs(np.array(told) - expected)
     assert apart[:, :, 0].max() == 0

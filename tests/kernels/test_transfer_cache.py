@@ -25,9 +25,12 @@ ROWS, COLS, STRIDE = 13, 19, 1
 CAMERA = CameraModel(width=COLS, height=ROWS, fx=40.0, fy=40.0, cx=9.0, cy=6.0)
 SPACING = STRIDE / CAMERA.fx
 RAYS = direction_sets(33, 2)
-WORDS = 18 + 2 + 4 + 9
+WORDS = 20 + 2 + 4 + 9
 """Of an entry: with 33 directions in the mask, 2 x 2 coefficients, every fourth direction's surface."""
 REACH_M = 10.0
+AS_KEPT, ANEW, OF_ANOTHER = 0, 1, 2
+"""As in ways.clh."""
+NEVER = 1 << 30
 CLEAR = 1e-3
 """Margin of samples from borders of cells, over which float32 cannot carry them."""
 FACES = random_directions(12, 3)
@@ -36,10 +39,11 @@ FACES = random_directions(12, 3)
 class Frames:
     """Frames of samples with values of their own, for the kernels and for the twin."""
 
-    def __init__(self, engine: Engine, places: int, period: int) -> None:
+    def __init__(self, engine: Engine, monkeypatch: pytest.MonkeyPatch, places: int, period: int) -> None:
+        monkeypatch.setattr(transfer_cache, "CHECKS", NEVER)  # their values are no rays'
         self.volume: Volume = fill_volume(engine, SCENES["floor under a wall"], 0.05)
         self.cache = TransferCache(engine)
-        self.twin = Table(places, period, transfer_cache.LONGEST)
+        self.twin = Table(places, period)
         self.random = np.random.default_rng(7)
         self._engine = engine
         self.now = 0
@@ -61,14 +65,16 @@ class Frames:
                     break
         return Samples(points, normals, self.random.random(count) > 0.05, COLS, eye, SPACING)
 
-    def find(self, samples: Samples, reach_m: float = REACH_M) -> NDArray[np.int64]:
+    def find(self, samples: Samples, reach_m: float = REACH_M, *, renews: bool = False) -> NDArray[np.int64]:
         """[n] as TransferCache.find returns it."""
         shape = (ROWS, COLS)
         points, normals = samples.points.reshape(*shape, 3), samples.normals.reshape(*shape, 3)
         surface = upload_surface(self._engine, points, normals, samples.valid.reshape(shape))
         pose = np.eye(4)
         pose[:3, 3] = samples.eye
-        kept = self.cache.find(CAMERA, self.volume, surface, pose, STRIDE, RAYS, reach_m)
+        kept = self.cache.find(
+            CAMERA, self.volume, surface, pose, STRIDE, RAYS, reach_m, traces_all=renews, renews=renews
+        )
         return self._engine.download(kept).astype(np.int64).ravel().copy()
 
     def step(self, eye: Floats) -> tuple[Samples, NDArray[np.int64]]:
@@ -91,6 +97,8 @@ class Frames:
         self._check(is_kept | is_lent, values)
         after = self.twin.store(samples, self.now, kept, values)
         np.testing.assert_array_equal(self._engine.download(cells.places).ravel(), after)
+        ways = np.select([is_kept, is_lent], [AS_KEPT, OF_ANOTHER], ANEW)
+        np.testing.assert_array_equal(self._engine.download(cells.ways).ravel(), ways)
         assert (self._engine.download(cells.claims) == 0xFFFFFFFF).all()
         waits = is_lent.sum() + self.waiting_entries(kept)
         assert self.cache.share_waiting() == waits / (ROWS * COLS)
@@ -111,7 +119,7 @@ class Frames:
         """How many cells were too old in the last frame, and were not traced."""
         found = {int(place) for place in kept if 0 <= place < LENT}
         entries = [self.twin.entries[place] for place in found]
-        return sum(self.now - entry.traced >= entry.lasts for entry in entries)
+        return sum(self.now - entry.traced >= self.twin.period for entry in entries)
 
     def _check(self, chosen: NDArray[np.bool_], values: Floats) -> None:
         for array in self._arrays():
@@ -147,13 +155,12 @@ class Frames:
 def test_samples_are_found_and_kept_as_by_the_twin(
     engine: Engine, monkeypatch: pytest.MonkeyPatch, most_places: int, period: int, share: float
 ) -> None:
-    """A wide table, one that is too small, and one whose cells soon are too old, and then last longer; with samples
-    that wait for their turn and without."""
+    """A wide table, one that is too small, and one whose cells soon are too old; with samples that wait for their turn
+    and without."""
     monkeypatch.setattr(transfer_cache, "MOST_BYTES", most_places * 4 * WORDS)
     monkeypatch.setattr(transfer_cache, "PERIOD", period)
-    monkeypatch.setattr(transfer_cache, "LONGEST", 3 * period)
     monkeypatch.setattr(transfer_cache, "MOST_TRACED", share)
-    frames = Frames(engine, places_for(ROWS * COLS, WORDS), period)
+    frames = Frames(engine, monkeypatch, places_for(ROWS * COLS, WORDS), period)
     shares, lent = [], []
     for eye in (
         np.zeros(3),
@@ -168,13 +175,11 @@ def test_samples_are_found_and_kept_as_by_the_twin(
     assert shares[0] == 0
     assert (lent[0] > 0.15) == (share < 1)
     assert shares[1] > (0.3 if most_places > 64 else 0.05) * (1 if share == 1 else 0.3)
-    lasting = {entry.lasts for entry in frames.twin.entries.values()}
-    assert lasting >= {period} if period > 3 or share < 1 else lasting == {period, 2 * period, 3 * period}
     assert max(shares) < 0.97  # some are invalid, and some face another way than their cell
 
 
-def test_another_way_of_sampling_begins_anew(engine: Engine) -> None:
-    frames = Frames(engine, places_for(ROWS * COLS, WORDS), transfer_cache.PERIOD)
+def test_another_way_of_sampling_begins_anew(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = Frames(engine, monkeypatch, places_for(ROWS * COLS, WORDS), transfer_cache.PERIOD)
     frames.step(np.zeros(3))
     samples, kept = frames.step(np.zeros(3))
     assert ((kept >= 0) & (kept < LENT)).any()
@@ -182,10 +187,22 @@ def test_another_way_of_sampling_begins_anew(engine: Engine) -> None:
     assert ((kept < 0) | (kept >= LENT)).all()
 
 
+def test_all_is_traced_in_a_frame_that_renews(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was kept as well: the first sample of each cell will fill it again."""
+    frames = Frames(engine, monkeypatch, places_for(ROWS * COLS, WORDS), transfer_cache.PERIOD)
+    frames.step(np.zeros(3))
+    samples, kept = frames.step(np.zeros(3))
+    is_kept = (kept >= 0) & (kept < LENT)
+    assert is_kept.mean() > 0.1
+    renewed = frames.find(samples, renews=True)
+    assert (renewed[samples.valid] < 0).all()
+    np.testing.assert_array_equal(renewed[is_kept], -2 - kept[is_kept])
+
+
 def test_a_frame_that_was_given_up_leaves_no_claims(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each third frame ends before anything is stored."""
     monkeypatch.setattr(transfer_cache, "PERIOD", 3)
-    frames = Frames(engine, places_for(ROWS * COLS, WORDS), 3)
+    frames = Frames(engine, monkeypatch, places_for(ROWS * COLS, WORDS), 3)
     for _ in range(8):
         frames.step(np.zeros(3))
         _, kept = frames.step(np.zeros(3))
@@ -198,14 +215,13 @@ def test_no_cell_waits_for_ever(engine: Engine, monkeypatch: pytest.MonkeyPatch,
     """However few are traced: each cell that is in view again and again is traced ORDERS frames after its time."""
     monkeypatch.setattr(transfer_cache, "MOST_TRACED", share)
     monkeypatch.setattr(transfer_cache, "PERIOD", 3)
-    monkeypatch.setattr(transfer_cache, "LONGEST", 6)
-    frames = Frames(engine, places_for(ROWS * COLS, WORDS), 3)
+    frames = Frames(engine, monkeypatch, places_for(ROWS * COLS, WORDS), 3)
     samples = frames.samples(np.zeros(3))
     monkeypatch.setattr(frames, "samples", lambda _: samples)
     for _ in range(80):
         _, kept = frames.step(np.zeros(3))
         seen = [entry for entry in frames.twin.entries.values() if entry.used == frames.now]
-        assert max((frames.now - entry.traced - entry.lasts for entry in seen), default=0) <= ORDERS
+        assert max((frames.now - entry.traced - 3 for entry in seen), default=0) <= ORDERS
     if share > 0:
         assert (kept >= LENT).mean() < 0.02
 

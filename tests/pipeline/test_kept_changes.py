@@ -14,7 +14,7 @@ from server.pipeline import FrameResult
 from server.shading.kept_changes import HARDLY, LEAST_CODES, STEPS, KeptChanges, bound_of
 from server.shading.kept_shadows import LONGEST
 from server.transfer.kept_bounds import MEASURED, NOT_YET, KeptBounds
-from server.transfer.transfer_cache import ORDERS, PERIOD
+from server.transfer.transfer_cache import CHECKS, ORDERS, PARTS
 from tests.scenes.analytic import Floats
 
 
@@ -101,9 +101,9 @@ def test_the_last_frames_count_in_which_something_was_found(engine: Engine) -> N
     assert kept.bounds() == KeptBounds(0.0, 0.0)
 
 
-FRAMES = 44
-AGAIN = PERIOD + ORDERS
-"""The first frame of whose transfer a bound is known: that of the first frames was traced again."""
+FRAMES = 60
+AGAIN = CHECKS * PARTS + ORDERS
+"""The first frame of whose transfer a bound is known: that of the first frames was looked at again."""
 
 
 def kept_bounds(result: FrameResult) -> dict[str, float | None]:

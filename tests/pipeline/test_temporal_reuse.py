@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +24,7 @@ from server.reuse.temporal_reuse import (
     SceneVersion,
     TemporalReuse,
 )
+from server.transfer.radiance_transfer import TURNS
 from tests.scenes import lights
 
 CAMERA = CameraModel(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
@@ -120,6 +122,24 @@ def test_a_light_that_still_moves_is_followed(engine: Engine) -> None:
 def test_it_rests_under_noise(engine: Engine) -> None:
     assert fed_noise(TemporalReuse(engine, CAMERA), NOISY - 1) is None
     assert fed_noise(TemporalReuse(engine, CAMERA), NOISY) == CullReason(NOISE, ALLOWANCE)
+
+
+def test_transfer_is_renewed_once_before_a_view_settles(engine: Engine) -> None:
+    """Before the first of the pictures that are compared; not where frames are equal, which rest as soon, and not for a
+    camera that does not rest."""
+
+    def renewed(reuse: TemporalReuse, frame: Callable[[int], RgbdFrame]) -> list[int]:
+        frames = []
+        for index in range(NOISY + 4):
+            decision = reuse.decide(frame(index), SCENE)
+            reuse.observe(decision, LIGHT, PICTURE if decision.is_checkpoint else None)
+            frames += [index] if decision.renews_transfer else []
+        return frames
+
+    assert renewed(TemporalReuse(engine, CAMERA), noisy) == [TURNS - 1]
+    assert TURNS < NOISY // 2
+    assert not renewed(TemporalReuse(engine, CAMERA, poses="track"), noisy)
+    assert not renewed(TemporalReuse(engine, CAMERA), lambda index: replace(FRAME, index=index))
 
 
 def test_a_picture_that_has_not_settled_is_drawn_anew(engine: Engine) -> None:

@@ -152,8 +152,9 @@ def test_a_thing_that_comes_in_shades_nearly_as_without(device: Device, preset: 
 
 @pytest.mark.parametrize("preset", ["reg4", "gr15fast"])
 def test_a_view_at_rest_is_drawn_with_nothing_that_was_kept(device: Device, preset: Preset) -> None:
-    """It is shown as long as it rests. The real ball that came in is in the light of surfaces, too."""
-    source = GallerySource("hand", 160, SETTLED_NOISY + 12)
+    """It is shown as long as it rests. The real ball that came in is in the light of surfaces, too. Transfer is renewed
+    when the view begins to be still, and what shadows keep follows it."""
+    source = GallerySource("hand", 160, SETTLED_NOISY + 20)
     on, off = (
         [result for _, result in play(device, source, wishes_of(source, cache=cache, preset=preset))]
         for cache in ("on", "off")
@@ -173,7 +174,7 @@ def test_cells_that_are_traced_again_show_what_has_changed(
     frames before there, and but for surface that only the sensor knows in image space."""
     monkeypatch.setattr(transfer_cache, "MOST_TRACED", 1.0)
     monkeypatch.setattr(transfer_cache, "PERIOD", 1)
-    monkeypatch.setattr(transfer_cache, "LONGEST", 1)
+    monkeypatch.setattr(transfer_cache, "PERIOD_OF_VIEWS", 1)
     monkeypatch.setattr(shadow_cells, "LONGEST", 1)
     for kind in (shadow_cells.RealShadows, shadow_cells.VirtualOcclusions):
         monkeypatch.setattr(kind, "close", 0.0)  # else the mean with the last frame's

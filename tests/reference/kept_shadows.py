@@ -57,13 +57,22 @@ class KeptTable:
     changes: dict[bool, list[float]] = field(default_factory=dict)
     """Codes by which what the frame before showed was off; by whether it was lent."""
 
-    def step(self, own: Floats, since: int, *, fills: bool = True, lent: NDArray[np.bool_] | None = None) -> Floats:
+    def step(
+        self,
+        own: Floats,
+        since: int,
+        *,
+        fills: bool = True,
+        lent: NDArray[np.bool_] | None = None,
+        traced: NDArray[np.bool_] | None = None,
+    ) -> Floats:
         """[n, 3] what is shown in the next frame, in which samples would find `own`; since: see kept_shadows.py. fills:
-        what is found is kept; else the frame is still to come. lent: [n] samples with the transfer of others."""
+        what is found is kept; else the frame is still to come. lent: [n] samples with the transfer of others; traced:
+        those whose own was traced in this frame."""
         self.now += 1
         self.stands = self.lent = 0
         self.changes = {False: [], True: []}
-        are_lent = np.zeros(len(own), bool) if lent is None else lent
+        are_lent, are_traced = (np.zeros(len(own), bool) if each is None else each for each in (lent, traced))
         shown, asked = own.copy(), dict[int, tuple[tuple[bool, bool, int], Entry]]()
         self.anew = 0
         for i, (key, place) in enumerate(self.cells):
@@ -73,7 +82,7 @@ class KeptTable:
             is_other, is_lent = False, bool(are_lent[i])
             lasts = 1.0 if entry is None else max(entry.lasts, 1.0)
             if entry is not None and is_true:
-                if not self._is_due(entry, place):
+                if not (are_traced[i] or self._is_due(entry, place)):
                     shown[i] = entry.value
                     self.stands += 1
                     continue

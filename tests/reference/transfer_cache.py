@@ -63,7 +63,6 @@ class Entry:
 
     key: tuple[int, int]
     traced: int
-    lasts: int
     used: int
     position: Floats
     normal: Floats
@@ -111,7 +110,6 @@ class Table:
 
     places: int
     period: int
-    longest: int
     entries: dict[int, Entry] = field(default_factory=dict)
 
     def cell_of(self, samples: Samples, i: int) -> Cell:
@@ -155,9 +153,8 @@ class Table:
                 samples.normals[i],
             )
             is_known = _is_of(entry, cell, point, normal)
-            lasts = min(2 * entry.lasts, self.longest) if entry is not None and is_known else self.period
             earlier = 0 if is_known else mixed((cell.key[0] + cell.key[1]) & _MASK) % self.period
-            self.entries[place] = Entry(cell.key, now - earlier, lasts, now, point, normal, float(values[i]))
+            self.entries[place] = Entry(cell.key, now - earlier, now, point, normal, float(values[i]))
             places[i] = place
         return places
 
@@ -171,7 +168,7 @@ class Table:
                 continue
             entry = self.entries[own[0]]
             entry.used = now
-            found[i] = own[0] if now - entry.traced < entry.lasts else -2 - own[0]
+            found[i] = own[0] if now - entry.traced < self.period else -2 - own[0]
         return found
 
     def _lender_of(self, samples: Samples, i: int, found: NDArray[np.int64], traced: set[int]) -> int | None:

@@ -41,8 +41,8 @@ LARGE_WIDTH = 320
 CAMERA_WIDTH, CAMERA_FRAMES = 640, 24
 """A camera's own pictures, and frames enough for what is kept to be met again."""
 QUICK_AT_CAMERA = ("closed-room", "soft-sky", "sharp-sun")
-KEPT_FRAMES = 60
-"""Frames of which the last half tells how far off what is kept may be."""
+KEPT_FRAMES = 80
+"""Frames whose last 32 tell how far off what is kept may be: in the others its bound is not known yet."""
 HELD = frozenset({"composite"})
 """Effects of a frame whose virtual things are held."""
 WARM_UP = 2

@@ -15,7 +15,7 @@ from protocol.frames import CameraModel
 from server.opencl.engine import Engine
 from server.transfer import transfer_cache
 from server.transfer.radiance_transfer import TURNS, direction_sets, transfer_radiance
-from server.transfer.transfer_cache import LONGEST, ORDERS, TransferCache
+from server.transfer.transfer_cache import CHECKS, ORDERS, PARTS, TransferCache
 from server.volume.volume import Volume
 from tests.hard_cases.catalogue import Family, Floats, Found, Trial
 from tests.scenes.analytic import look_at
@@ -86,7 +86,7 @@ class _Seen:
             self._engine, points.reshape(*shape, 3), normals.reshape(*shape, 3), valid.reshape(shape)
         )
         self._frames += 1
-        kept = self._cache.find(WIDE, self.volume, surface, pose, 1, RAYS, ROOM_M)
+        kept = self._cache.find(WIDE, self.volume, surface, pose, 1, RAYS, ROOM_M, with_hits=False)
         if is_given_up:
             return np.zeros(0)
         turn = self._frames % TURNS
@@ -155,7 +155,7 @@ def _changed(trial: Trial, before: Scene, after: Scene, frames: int, gives_up: i
     before anything is stored; what it asked for must not keep others from it."""
     seen = _Seen(trial.engine, before)
     eye, target = np.array([0.5, 0.55, 0.5]), np.array([0.5, 0.3, 0.52])
-    for scene, count in ((before, UNTIL_LONGEST), (after, frames)):
+    for scene, count in ((before, UNTIL_OLD), (after, frames)):
         seen.change(scene)
         for number in range(1, count):
             is_given_up = gives_up > 0 and number % gives_up == 0
@@ -166,17 +166,19 @@ def _changed(trial: Trial, before: Scene, after: Scene, frames: int, gives_up: i
 
 
 ASIDE_M = np.array([0.025, 0.0, 0.025])  # as far as samples are apart: they have other numbers
-UNTIL_LONGEST, UNTIL_TRACED = 4 * LONGEST, LONGEST + ORDERS
-"""Frames until cells last longest, and until the last of them is traced anew."""
+UNTIL_OLD, UNTIL_TRACED = 2 * CHECKS * PARTS, CHECKS * PARTS + ORDERS
+"""Frames in which all is kept, and those until all rays of a cell were checked and it was traced anew."""
 
 
-@KEPT.case("walls taken from around a floor", 0, "of the sky", "open floor, once the oldest cell was traced anew.")
+@KEPT.case(
+    "walls taken from around a floor", 0, "of the sky", "open floor, once the last cell was checked and traced anew."
+)
 def walls_go(trial: Trial) -> Found:
     return Found(_changed(trial, CLOSED, FLOOR, UNTIL_TRACED), 1.0)
 
 
 @KEPT.case(
-    "walls put around a floor", LEAK, "of the sky", "rays between voxels' corners, once the oldest cell was traced."
+    "walls put around a floor", LEAK, "of the sky", "rays between voxels' corners, once the last cell was traced anew."
 )
 def walls_come(trial: Trial) -> Found:
     return Found(_changed(trial, FLOOR, CLOSED, UNTIL_TRACED), 0.0)
@@ -186,4 +188,4 @@ def walls_come(trial: Trial) -> Found:
     "walls taken away, each third frame given up", 0, "of the sky", "a cell's turn is given up twice in a row at most."
 )
 def walls_go_between_failures(trial: Trial) -> Found:
-    return Found(_changed(trial, CLOSED, FLOOR, LONGEST + 3 * ORDERS, gives_up=3), 1.0)
+    return Found(_changed(trial, CLOSED, FLOOR, UNTIL_TRACED + CHECKS * PARTS, gives_up=3), 1.0)

@@ -91,7 +91,7 @@ class SampledTransfer:
         if not self._has_found or self._cache is None:
             return ()
         looks = f"looked up again after {PERIOD_OF_VIEWS + ORDERS} frames at most"
-        if self._sampler.depth_views is None:
+        if not self._sampler.sampling.image_space:
             looks = f"all its rays are traced again in {CHECKS * PARTS} frames, to see whether they changed"
         reason = f"kept at the same place of the world; in view, {looks}"
         bound = bounds.known if self._cache.has_looked_again or not bounds.known else None
@@ -132,7 +132,7 @@ class SampledTransfer:
                 ray_length_m,
                 is_traced=is_traced,
                 with_hits=with_indirect,
-                traces_all=renews or (is_first and stride > 1),
+                traces_all=is_first and stride > 1,
                 renews=renews,
             )
         self._has_begun = True

@@ -7,10 +7,11 @@ have an entry each. An entry belongs to a point in the same cell. Surface that m
 of the scan depends on where it is only.
 
 A cell is traced again when what it sees has changed. This is checked: every CHECKS-th frame in which an entry is found,
-one of PARTS of its rays are traced from where they began. In the same volume they end the same, to the bit; one that
-ends otherwise makes the entry too old. A change that covers a share s of the rays is noticed with the first check with
-probability 1 - (1 - s)^n, n being the rays of a part that rise above the surface, and after CHECKS PARTS frames in any
-case. What rays cannot tell, as the colour of surface that they meet, is renewed after PERIOD frames.
+one of PARTS of its rays, and those whose surface is known, are traced from where they began. In the same volume they
+end the same, to the bit. If an eighth of them are free that were blocked, or the other way, or of the known surface an
+eighth lies elsewhere, the entry is too old. So a change that covers much of what a cell sees is noticed with the first
+check, and any that covers an eighth of the rays of a part in CHECKS PARTS frames. Smaller ones, and what rays cannot
+tell, as the colour of surface, are renewed after PERIOD frames.
 
 A frame traces MOST_TRACED of its samples, in an order that covers the picture evenly: new ones first, each of them as
 far as possible from those before it, then one of each cell that is too old. New ones that wait take the values of the
@@ -18,9 +19,9 @@ nearest sample on the same surface, three samples away at most; where there is n
 frames find or trace them. Old ones that wait stand as they are, ORDERS frames at most. So a frame that turns to what
 was never seen costs little more than others. A session's first one traces all (samples.py).
 
-So an entry in view is off by what the scan has changed around it in CHECKS PARTS + ORDERS frames at most, by colours
-of PERIOD + ORDERS; one that comes into view again, by what has changed since it left it, until it is checked. How far
-off that makes a picture is measured (kept_changes.py). Of a view that comes to rest, all samples are traced
+So an entry in view is off by what the scan has changed around it in CHECKS PARTS + ORDERS frames at most, by what is
+small of PERIOD + ORDERS; one that comes into view again, by what has changed since it left it, until it is checked. How
+far off that makes a picture is measured (kept_changes.py). Of a view that comes to rest, all samples are traced
 (samples.py).
 
 Transfer that is looked up in depth views (image_space.py) is kept likewise, with what the camera's picture adds near a
@@ -149,8 +150,8 @@ class TransferCache:
         `transfer_radiance` and `gather_hits` return, which leave it out, or will be there after `store`.
 
         is_traced: by rays, which can be checked; else looked up in depth views. with_hits: `gather_hits` follows.
-        traces_all: none that is new or too old waits; renews: all are too old. What was found otherwise, by other rays,
-        in another volume or by another camera model is forgotten.
+        traces_all: none that is new or too old waits; renews: nor is what is kept used. What was found otherwise, by
+        other rays, in another volume or by another camera model is forgotten.
         """
         engine, transfer = self._engine, traced_transfer(self._engine, camera, stride, rays)
         hits, met = room_for_hits(engine, transfer), room_for_met(engine, transfer, rays)
@@ -176,7 +177,7 @@ class TransferCache:
             met=met.shape[2] if with_hits else 0,
             ray_length_m=ray_length_m,
             places=places,
-            most=samples if traces_all else int(MOST_TRACED * samples),
+            most=samples if traces_all or renews else int(MOST_TRACED * samples),
         )
         self._frame = _Frame(volume, surface, transfer, rays, hits, met, places, words, parameters, defines)
         buffers, size = self._buffers, (transfer.cols, transfer.rows)

@@ -72,9 +72,7 @@ class Frames:
         surface = upload_surface(self._engine, points, normals, samples.valid.reshape(shape))
         pose = np.eye(4)
         pose[:3, 3] = samples.eye
-        kept = self.cache.find(
-            CAMERA, self.volume, surface, pose, STRIDE, RAYS, reach_m, traces_all=renews, renews=renews
-        )
+        kept = self.cache.find(CAMERA, self.volume, surface, pose, STRIDE, RAYS, reach_m, renews=renews)
         return self._engine.download(kept).astype(np.int64).ravel().copy()
 
     def step(self, eye: Floats) -> tuple[Samples, NDArray[np.int64]]:

@@ -159,7 +159,7 @@ class TemporalReuse:
             keeps_geometry=keeps_geometry,
             version=Version(self._view, self._objects, count % period),
             is_checkpoint=self._reason is None and count % period == 0,
-            renews_transfer=self._may_settle() and count == TURNS,
+            renews_transfer=self._reason is None and count == TURNS and not self._is_tracked,
             echo=CullReason(ECHO, ALLOWANCE) if self._echo_frames else None,
         )
 
@@ -187,10 +187,6 @@ class TemporalReuse:
         if self._reason is None and count >= MOST_FRAMES:
             self._changes.forget()
             self._begin_view()
-
-    def _may_settle(self) -> bool:
-        """Whether frames differ by noise, and the view does not rest yet, but can."""
-        return self._reason is None and not self._changes.is_exact and not self._is_tracked
 
     def _begin_view(self) -> None:
         if self._reason is not None and (np.array(self._lights) != self._lights[-1]).any():

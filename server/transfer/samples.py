@@ -90,8 +90,9 @@ class SampledTransfer:
         """What of the last frame's transfer may have been found instead of traced. bounds: of what is drawn with it."""
         if not self._has_found or self._cache is None:
             return ()
-        looks = f"looked up again after {PERIOD_OF_VIEWS + ORDERS} frames at most"
-        if not self._sampler.sampling.image_space:
+        if self._sampler.sampling.image_space:
+            looks = f"looked up again after {PERIOD_OF_VIEWS + ORDERS} frames at most"
+        else:
             looks = f"all its rays are traced again in {CHECKS * PARTS} frames, to see whether they changed"
         reason = f"kept at the same place of the world; in view, {looks}"
         bound = bounds.known if self._cache.has_looked_again or not bounds.known else None

@@ -105,6 +105,8 @@ class _Frame:
     surface: Surface
     transfer: Transfer
     rays: Directions
+    is_traced: bool
+    """By rays; else looked up in depth views."""
     hits: cl_array.Array
     met: cl_array.Array
     places: int
@@ -179,7 +181,7 @@ class TransferCache:
             places=places,
             most=samples if traces_all or renews else int(MOST_TRACED * samples),
         )
-        self._frame = _Frame(volume, surface, transfer, rays, hits, met, places, words, parameters, defines)
+        self._frame = _Frame(volume, surface, transfer, rays, is_traced, hits, met, places, words, parameters, defines)
         buffers, size = self._buffers, (transfer.cols, transfer.rows)
         found, kept = (of.array((transfer.rows, transfer.cols)) for of in (buffers.found, buffers.kept))
         counts = engine.array_to_read((2 * ORDERS + 1,), np.int32)
@@ -224,7 +226,7 @@ class TransferCache:
     @property
     def has_looked_again(self) -> bool:
         """Whether what it began with was checked or found anew since, so that changes have shown."""
-        is_traced = self._frame is not None and "IS_TRACED" in self._frame.defines
+        is_traced = self._frame is not None and self._frame.is_traced
         return self._now - self._begun > (CHECKS * PARTS if is_traced else PERIOD_OF_VIEWS) + ORDERS
 
     def store(self) -> Cells:
@@ -237,7 +239,7 @@ class TransferCache:
         parts, frames = buffers.disc_parts.array((places,)), buffers.disc_frames.array((places,))
         kept, ways = (of.array((transfer.rows, transfer.cols)) for of in (buffers.kept, buffers.ways))
         to_check: tuple[KernelArgument, ...] = ()
-        if "IS_TRACED" in frame.defines:
+        if frame.is_traced:
             to_check = (
                 room_for_mean_normals(engine, transfer),
                 *frame.volume.arguments()[:4],

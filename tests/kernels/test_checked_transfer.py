@@ -48,7 +48,7 @@ CLOSED: Scene = [
     box((0.0, 0.94, 0.0), (1.0, 1.0, 1.0)),
 ]
 BALL = ball((0.75, 0.35, 0.3), 0.16)
-EVERYTHING_OLD = 1 << 20
+NEVER_OLD = 1 << 20
 """A period that no test reaches."""
 
 
@@ -142,7 +142,7 @@ def unpacked(met: NDArray[np.uint32]) -> dict[int, float]:
 @pytest.fixture(autouse=True)
 def nothing_is_old(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples are traced only because they are new, or because their rays have changed; each has a cell of its own."""
-    monkeypatch.setattr(transfer_cache, "PERIOD", EVERYTHING_OLD)
+    monkeypatch.setattr(transfer_cache, "PERIOD", NEVER_OLD)
     monkeypatch.setattr(transfer_cache, "MOST_TRACED", 1.0)
     monkeypatch.setattr(transfer_cache, "PLACES_A_SAMPLE", 512)
 

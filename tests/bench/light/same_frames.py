@@ -1,4 +1,5 @@
-"""The kitchen's first frames in other volumes, with other noise, without one of them: the light stays the same.
+"""The kitchen's first frames in other volumes, from other origins, with other noise, without one of them: the light
+stays the same.
 
 It is the light from beyond the scan, of `light.jsonl`'s `sh`, found as `probeless run` does.
 """
@@ -30,6 +31,9 @@ QUICK_VOLUMES = 2
 """Of a quick run, which has one of all else."""
 COARSER = 1.25
 """Size of the larger voxels, over the default."""
+ORIGINS_M = (0.04, 0.08, 0.11)
+"""By how much the world's origin is moved along each axis: quarters of a patch, rounded to whole voxels, so that scan
+and rays stay as they are."""
 
 Lights = dict[int, tuple[NDArray[np.float64], float]]
 """By frame: [bands^2, 3], and its spread in degrees."""
@@ -56,12 +60,15 @@ class _Kitchen:
         }
         volume = volumes[VOLUMES[0]]
         voxel_m = default_voxel(volume)
-        x0, y0, z0, x1, y1, z1 = (side + voxel_m / 2 for side in volume)
-        noises, left_out = (self.run.of(1, n) for n in (NOISES, len(LEFT_OUT)))
+        noises, left_out, origins = (self.run.of(1, n) for n in (NOISES, len(LEFT_OUT), len(ORIGINS_M)))
         return {
             "volumes": [self.lights(other, default_voxel(other), frames) for other in volumes.values()],
-            "half a voxel's shift": [self.lights((x0, y0, z0, x1, y1, z1), voxel_m, frames)],
+            "half a voxel's shift": [self.lights(moved_volume(volume, voxel_m / 2), voxel_m, frames)],
             "voxels a quarter larger": [self.lights(volume, COARSER * voxel_m, frames)],
+            "another origin": [
+                self.lights(moved_volume(volume, by_m), voxel_m, moved_frames(frames, by_m))
+                for by_m in ORIGINS_M[:origins]
+            ],
             "one code of noise": [self.lights(volume, voxel_m, noisy_frames(frames, seed)) for seed in range(noises)],
             "a frame left out": [
                 self.lights(volume, voxel_m, {i: frame for i, frame in frames.items() if i != without})
@@ -95,6 +102,23 @@ def turns_between(pairs: list[tuple[Lights, Lights]]) -> tuple[list[float], list
             turns.append(direction_error_deg(some[index][0], others[index][0]))
             shares.append(turns[-1] / min(some[index][1], others[index][1]))
     return turns, shares
+
+
+def moved_frames(frames: Mapping[int, RgbdFrame], by_m: float) -> dict[int, RgbdFrame]:
+    """The same, seen in a world whose origin lies `by_m` metres farther back along each axis."""
+    moved = {}
+    for index, frame in frames.items():
+        assert frame.world_from_camera is not None
+        pose = np.array(frame.world_from_camera, np.float64)
+        pose[:3, 3] += by_m
+        moved[index] = replace(frame, world_from_camera=pose)
+    return moved
+
+
+def moved_volume(volume: Volume, by_m: float) -> Volume:
+    """`volume`, moved by `by_m` metres along each axis."""
+    x0, y0, z0, x1, y1, z1 = (side + by_m for side in volume)
+    return x0, y0, z0, x1, y1, z1
 
 
 def noisy_frames(frames: Mapping[int, RgbdFrame], seed: int) -> dict[int, RgbdFrame]:

@@ -50,3 +50,11 @@ def test_every_way_to_import_one_is_found(line: str) -> None:
 def test_helpers_may_be_imported() -> None:
     allowed = "from tests.scenes.solids import box\nfrom server.maths import sh\nimport tests.data"
     assert from_test_files(allowed) == []
+
+
+def test_only_own_kernel_turns_warnings_into_errors() -> None:
+    """A test that compiles by itself fails on processors without AVX-512, for a warning that means nothing."""
+    strict = [
+        path.relative_to(TESTS).as_posix() for path in TESTS.rglob("*.py") if '"-W' + 'error"' in path.read_text()
+    ]
+    assert strict == ["scenes/own_kernel.py"]

@@ -15,14 +15,15 @@ from server.opencl.structs import struct_text
 
 KERNEL_FOLDER = Path(cl_kernels.__file__).parent
 _OPTIONS = ("-cl-std=CL1.2", "-Werror", "-cl-fp32-correctly-rounded-divide-sqrt")
-_PROLOGUE = """#ifdef __clang__
+PROLOGUE = """#ifdef __clang__
 #if __has_warning("-Wpsabi")
 #pragma clang diagnostic ignored "-Wpsabi"
 #endif
 #endif
 """
-"""Where a processor has no registers for float16, clang warns that other compilers would pass it otherwise: no call
-leaves a program. NVIDIA's compiler is a clang that does not know this warning, which would be an error."""
+"""In front of every program. Where a processor has no registers for float16, clang warns that other compilers would
+pass it otherwise: no call leaves a program. NVIDIA's compiler is a clang that does not know this warning, which would
+be an error."""
 _LINE = re.compile(r'#line (\d+) "([^"]+)"')
 _UNNAMED = re.compile(r"<kernel>:(\d+):")
 _INCLUDE = re.compile(r'#include "([^"]+)"')
@@ -112,7 +113,7 @@ class ProgramCache:
 
     def _build(self, file: str, defines: tuple[str, ...]) -> cl.Program:
         path = next(KERNEL_FOLDER.rglob(file))  # names are unique over the folders
-        source = f"{_PROLOGUE}{struct_text()}{with_headers(path.read_text(), file)}"
+        source = f"{PROLOGUE}{struct_text()}{with_headers(path.read_text(), file)}"
         options = [*self._options, *defines]
         try:
             program: cl.Program = cl.Program(self._context, source).build(options)

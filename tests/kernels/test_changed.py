@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pyopencl as cl
 import pytest
 
 from protocol.frames import CameraModel
@@ -14,6 +13,7 @@ from server.opencl.program import with_headers
 from server.opencl.structs import CHANGED_PARAMETERS, struct_text
 from tests.reference.changed import Floats, change_at
 from tests.scenes.analytic import look_at
+from tests.scenes.own_kernel import own_kernel
 from tests.scenes.solids import float4
 
 SOURCE = """
@@ -52,12 +52,7 @@ def test_as_the_twin(engine: Engine, stride: int, is_nearest: bool) -> None:
     ratio = np.concatenate([random.uniform(0.2, 1.0, (*cells, 3)), random.random((*cells, 1)) > 0.1], -1)
     near = positions.reshape(-1, 4)[random.integers(0, WIDTH * HEIGHT, 3000), :3] + random.normal(0, 0.03, (3000, 3))
     points = np.concatenate([near, random.uniform(-2, 3, (500, 3))]).astype(np.float32).astype(float)
-    kernel = cl.Kernel(
-        cl.Program(engine.device.context, struct_text() + with_headers(SOURCE, "look_up.cl")).build(
-            ["-cl-std=CL1.2", "-Werror"]
-        ),
-        "look_up",
-    )
+    kernel = own_kernel(engine.device, struct_text() + with_headers(SOURCE, "look_up.cl"), "look_up")
     space = engine.workspace
     result = space.array("test_result", (len(points), 3), np.float32)
     engine.launch(

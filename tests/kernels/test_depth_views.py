@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pyopencl as cl
 import pytest
 import trimesh
 from numpy.typing import NDArray
@@ -34,6 +33,7 @@ from tests.scenes.analytic import look_at, pixel_rays
 from tests.scenes.depth_view_scene import host_views
 from tests.scenes.lights import random_directions
 from tests.scenes.meshes import pose, shape_of
+from tests.scenes.own_kernel import own_kernel
 from tests.scenes.solids import (
     SCENES,
     Box,
@@ -133,10 +133,7 @@ def scene_of(
 def probe(engine: Engine, scene: TracedScene, points: Floats, normals: Floats, offset_m: float = 0.0) -> Probed:
     """points, normals [n, 3] with n the directions of all sets. offset_m: > 0 asks for points of virtual surface."""
     defines = [f"-D{name}={value}" for name, value in scene.defines(engine).items()]
-    options = ["-cl-std=CL1.2", "-Werror", *defines]
-    kernel = cl.Kernel(
-        cl.Program(engine.device.context, struct_text() + with_headers(SOURCE, "probe.cl")).build(options), "probe"
-    )
+    kernel = own_kernel(engine.device, struct_text() + with_headers(SOURCE, "probe.cl"), "probe", defines)
     space, count = engine.workspace, len(points)
     found: list[Any] = [space.array(f"test_found_{k}", (count,), t) for k, t in enumerate((np.int32, "f4", "f4"))]
     places = space.upload("test_places", float4(np.zeros((count, 3)), np.ones(count)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pyopencl as cl
 import pytest
 
 from server.maths import sh
@@ -12,14 +11,14 @@ from server.opencl.engine import Engine
 from server.opencl.program import with_headers
 from tests.reference.sh import lambert_bands, sh_basis
 from tests.scenes.lights import random_directions
+from tests.scenes.own_kernel import own_kernel
 from tests.scenes.sh_kernel import AXES, NEAR_POLES, SOURCE
 from tests.scenes.tolerance import relative_tolerance
 
 
 @pytest.mark.parametrize("bands", range(2, 7))
 def test_basis_and_lambert(device: Device, engine: Engine, bands: int) -> None:
-    options = ["-cl-std=CL1.2", "-Werror", f"-DBANDS={bands}"]
-    kernel = cl.Kernel(cl.Program(device.context, with_headers(SOURCE, "evaluate.cl")).build(options), "evaluate")
+    kernel = own_kernel(device, with_headers(SOURCE, "evaluate.cl"), "evaluate", [f"-DBANDS={bands}"])
     directions = np.concatenate([AXES, NEAR_POLES, random_directions(500, 1)]).astype(np.float32)
     space, count = engine.workspace, len(directions)
     basis = space.array("basis", (count, bands * bands), np.float32)

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pyopencl as cl
 import pyopencl.cltypes as cl_types
 import pytest
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from server.scene.mesh import Mesh
 from server.scene.mipmaps import CHANNEL_VALUES, decoded, encoded, material_tables, mip_chain, shrunk
 from tests.reference import textures as twin
 from tests.scenes.meshes import mesh_of, pose
+from tests.scenes.own_kernel import own_kernel
 
 SOURCE = """
 #include "textures.clh"
@@ -100,8 +100,7 @@ def test_shrunk(width: int, height: int) -> None:
 @pytest.fixture
 def sample(engine: Engine) -> Any:
     """[n, 3] of texture number `texture` of some materials at uv [n, 2], with its changes."""
-    options = ["-cl-std=CL1.2", "-Werror"]
-    kernel = cl.Kernel(cl.Program(engine.device.context, with_headers(SOURCE, "sample.cl")).build(options), "sample")
+    kernel = own_kernel(engine.device, with_headers(SOURCE, "sample.cl"), "sample")
 
     def run(materials: list[Material], texture: int, uv: Floats, du: Floats, dv: Floats, probes: int = 4) -> Floats:
         tables, space = material_tables(materials), engine.workspace

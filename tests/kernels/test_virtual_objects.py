@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pyopencl as cl
 import pyopencl.cltypes as cl_types
 import pytest
 import trimesh
@@ -20,6 +19,7 @@ from server.opencl.structs import struct_text
 from server.scene.mesh import Mesh
 from tests.reference import voxelize as twin
 from tests.scenes.meshes import mesh_of, pose, public_mesh, shape_of
+from tests.scenes.own_kernel import own_kernel
 
 SOURCE = """
 #include "virtual_objects.clh"
@@ -41,10 +41,7 @@ Points = NDArray[np.float64]
 @pytest.fixture
 def trace(engine: Engine) -> Any:
     """Visibility of rays (origins [n, 3], directions [n, 3], reach) through a table."""
-    options = ["-cl-std=CL1.2", "-Werror"]
-    kernel = cl.Kernel(
-        cl.Program(engine.device.context, struct_text() + with_headers(SOURCE, "trace.cl")).build(options), "trace"
-    )
+    kernel = own_kernel(engine.device, struct_text() + with_headers(SOURCE, "trace.cl"), "trace")
 
     def run(
         table: ObjectTable, origins: Points, directions: Points, ray_length_m: float = FAR_M

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pyopencl as cl
 import pytest
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from tests.reference import visibility as twin
 from tests.reference.radiance_transfer import direction_set
 from tests.scenes.lanes import KINDS
 from tests.scenes.lights import random_directions
+from tests.scenes.own_kernel import own_kernel
 from tests.scenes.solids import SCENES, SIDE_M, fill_volume, float4, points_on, scattered, solid_voxels, upload_surface
 from tests.scenes.volumes import vectors
 
@@ -51,10 +51,7 @@ def boxes_of(
     device: Device, engine: Engine, volume: Volume, origins: Floats, normals: Floats, reach: float
 ) -> list[tuple[Floats, Floats]]:
     """Lower and upper corners [boxes, 3] of each point's boxes; voxels."""
-    options = ["-cl-std=CL1.2", "-Werror"]
-    kernel = cl.Kernel(
-        cl.Program(device.context, struct_text() + with_headers(BOXES, "boxes.cl")).build(options), "boxes"
-    )
+    kernel = own_kernel(device, struct_text() + with_headers(BOXES, "boxes.cl"), "boxes")
     space, count = engine.workspace, len(origins)
     inputs = [space.upload(f"box_{k}", float4(a)) for k, a in enumerate((origins, normals))]
     outputs = [space.upload(f"box_{name}", float4(np.zeros((count, MOST_BOXES, 3)))) for name in ("low", "high")]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import pyopencl as cl
 import pytest
 from pyopencl.tools import match_dtype_to_c_struct
 
 from server.opencl.device import Device
 from server.opencl.engine import Engine, float16, int4
 from server.opencl.structs import GRID, STRUCTS, VOLUME_SHAPE, Struct, struct_text
+from tests.scenes.own_kernel import own_kernel
 
 OUTER = Struct("Outer", count="int", inner=Struct("Inner", place="float4", size="int"), matrix="float16", last="float")
 
@@ -20,7 +20,7 @@ def offsets_on(engine: Engine, struct: Struct, before: str) -> list[int]:
     lines = "".join(f"    found[{i}] = (int)((char *)&value.{n} - (char *)&value);\n" for i, n in enumerate(names))
     body = f"    {struct.name} value;\n{lines}    found[{len(names)}] = sizeof(value);\n"
     source = f"{before}kernel void measure(global int *found) {{\n{body}}}\n"
-    kernel = cl.Kernel(cl.Program(engine.device.context, source).build(["-cl-std=CL1.2", "-Werror"]), "measure")
+    kernel = own_kernel(engine.device, source, "measure")
     found = engine.workspace.array(f"found_{struct.name}", (len(names) + 1,), np.int32)
     engine.launch(kernel, (1,), found, local=(1,))
     return [int(value) for value in engine.download(found)]
@@ -83,7 +83,7 @@ kernel void copy(const int first, const Outer outer, const float last, global fl
 }
 """
     )
-    kernel = cl.Kernel(cl.Program(engine.device.context, source).build(["-cl-std=CL1.2", "-Werror"]), "copy")
+    kernel = own_kernel(engine.device, source, "copy")
     result = engine.workspace.array("copied", (23,), np.float32)
     matrix = np.arange(100.0, 116.0).reshape(4, 4)
     inner = OUTER.dtype.fields["inner"][0]  # type: ignore[index]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pyopencl as cl
 
 from server.maths.nonnegative import faded
 from server.maths.sh import rotate_sh, spherical_fibonacci
@@ -14,6 +13,7 @@ from tests.reference.composite import srgb_codes
 from tests.reference.sh import open_transfer, sh_basis
 from tests.scenes.composite_scene import NONE_TAKEN, WALL, buffer, camera_picture, compose, plane
 from tests.scenes.lights import random_directions, unit
+from tests.scenes.own_kernel import own_kernel
 from tests.scenes.sh_kernel import AXES, NEAR_POLES, SOURCE
 
 HARMONICS = Family("spherical harmonics")
@@ -22,8 +22,7 @@ _SUN = unit([0.3, -0.8, -0.5])
 
 def _evaluate(trial: Trial, directions: Floats, bands: int) -> Floats:
     """[n, bands^2] of include/sh.clh."""
-    options = ["-cl-std=CL1.2", "-Werror", f"-DBANDS={bands}"]
-    kernel = cl.Kernel(cl.Program(trial.device.context, with_headers(SOURCE, "evaluate.cl")).build(options), "evaluate")
+    kernel = own_kernel(trial.device, with_headers(SOURCE, "evaluate.cl"), "evaluate", [f"-DBANDS={bands}"])
     space, count = trial.engine.workspace, len(directions)
     basis = space.array("basis", (count, bands * bands), np.float32)
     lambert = space.array("lambert", (bands,), np.float32)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from server.light.arrivals import begin_arrivals
 from server.light.shell.bright_surface import CELL_M, BrightSurface
-from server.light.shell.patches import PATCH_M, Patches
+from server.light.shell.patches import GRIDS, PATCH_M, Patches
 from server.light.shell.picture import Seen, SeenBright
 from server.opencl.engine import Engine
 from server.volume.volume import Volume
@@ -22,7 +22,7 @@ def show(surface: BrightSurface, at: Floats) -> None:
 
 
 def patches_before_the_lamps() -> Patches:
-    """25 of them, in a plane."""
+    """25 in each grid, in a plane."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(5) * PATCH_M, np.arange(5) * PATCH_M))
     patches = Patches()
     at, facing = np.stack([x, y, np.full(25, -0.5)], axis=1), np.tile([0.0, 0.0, 1.0], (25, 1))
@@ -45,12 +45,12 @@ def test_only_what_is_not_known_is_traced(engine: Engine) -> None:
     for lamp in LAMPS:
         show(surface, lamp)
     used = patches.used
-    assert asked_by(used) == [(25, 3)]
+    assert asked_by(used) == [(25 * GRIDS, 3)]
     assert asked_by(used[:2]) == [(2, 3)]
     for _ in range(4):
         show(surface, LAMPS[1] + np.array([0.1, 0.0, 0.0]))
     surface.visibility[used, surface.emitters()[1][0]] = 0  # what is known stays
-    assert asked_by(used[:2]) == [(2, 3), (23, 1)]
+    assert asked_by(used[:2]) == [(2, 3), (25 * GRIDS - 2, 1)]
     rows = surface.emitters()[1]
     visible = surface.visibility[np.ix_(used, rows)]
     assert (visible[:2] == 1).all()

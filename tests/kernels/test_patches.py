@@ -9,7 +9,9 @@ import pytest
 
 from protocol.frames import CameraModel
 from server.light.shell import picture as stage
+from server.light.shell.known_room import KnownPatches
 from server.light.shell.patches import (
+    GRIDS,
     MOST_PATCHES,
     MOST_WEIGHT,
     PATCH_M,
@@ -140,10 +142,24 @@ def test_a_patch_is_the_mean_of_its_frames() -> None:
     patches = Patches()
     for radiance in (0.1, 0.2, 0.4):
         patches.add(one(np.array([0.05, 0.05, 0.05]), radiance))
-    row = int(np.flatnonzero(patches.weights)[0])
-    np.testing.assert_allclose(patches.logarithms[row], np.log(0.2), atol=1e-12)
-    assert patches.weights[row] == 3
-    np.testing.assert_allclose(patches.changes(one(np.array([0.06, 0.04, 0.05]), 0.3))[0], [np.log(1.5)], atol=1e-12)
+    rows = patches.seen
+    assert len(rows) == GRIDS
+    np.testing.assert_allclose(patches.logarithms[rows], np.log(0.2), atol=1e-12)
+    assert (patches.weights[rows] == 3).all()
+    changes = patches.changes(one(np.array([0.06, 0.04, 0.05]), 0.3))[0]
+    np.testing.assert_allclose(changes, [np.log(1.5)] * GRIDS, atol=1e-12)
+
+
+def test_all_surface_lies_in_a_patch_of_each_grid() -> None:
+    """Of which the cells of one end in the middle of the other's, on all axes, below zero too."""
+    patches, along = Patches(), np.array([-1.2, -0.9, -0.6, -0.4, -0.1, 0.1, 0.4, 0.6, 0.9, 1.2])
+    places = PATCH_M * (0.3 + np.concatenate([np.outer(along, axis) for axis in np.eye(3)]))
+    patches.add(one(places, 0.5))
+    seen = patches.keys[patches.seen]
+    for grid, cells in enumerate(np.floor(places / PATCH_M + 0.5 * shift) for shift in range(GRIDS)):
+        np.testing.assert_array_equal(
+            np.unique(seen[seen[:, -1] == grid, :3], axis=0), np.unique(cells, axis=0).astype(int)
+        )
 
 
 @pytest.mark.parametrize(
@@ -176,11 +192,13 @@ def test_patches_are_put_together_where_the_scan_has_grown() -> None:
     larger = patches.grown(0.15)
     rows = larger.seen
     order = np.argsort(larger.positions[rows, 0])
-    assert (larger.side_m, larger.fresh) == (0.15, 2)
+    # One grid holds the first two places in one of its patches, the other the last two.
+    assert (larger.side_m, larger.fresh) == (0.15, 4)
     assert not patches.has_walls
     assert larger.has_walls
-    np.testing.assert_allclose(larger.positions[rows][order], [[0.06, 0.02, 0.02], [0.2, 0.02, 0.02]], atol=1e-12)
-    means = [(np.log(0.2) + np.log(0.4)) / 2, np.log(0.9)]
+    along = [0.02, 0.06, 0.15, 0.2]
+    np.testing.assert_allclose(larger.positions[rows][order], np.insert([[0.02] * 2] * 4, 0, along, 1), atol=1e-12)
+    means = np.log([0.2, np.sqrt(0.2 * 0.4), np.sqrt(0.4 * 0.9), 0.9])
     np.testing.assert_allclose(larger.logarithms[rows][order, 0], means, atol=1e-12)
     np.testing.assert_array_equal(larger.weights[rows], 3.0)
 
@@ -190,11 +208,31 @@ def test_small_patches_are_told_apart_and_resumed() -> None:
     places = np.array([[0.01, 0.01, 0.01], [0.03, 0.01, 0.01]])
     patches.add(one(places, 0.5))
     known = patches.known()
-    assert len(known.keys) == 2
-    again = Patches(known.side_m)
-    again.resume(known)
+    assert len(known.keys) == 2 * GRIDS
+    again = Patches.resumed(known)
     again.add(one(places, 0.5))
-    assert sorted(again.weights)[-3:] == [0.0, 2.0, 2.0]
+    assert sorted(again.weights)[-2 * GRIDS - 1 :] == [0.0, *[2.0] * 2 * GRIDS]
+
+
+def test_a_save_with_one_grid_is_resumed_with_all() -> None:
+    """As earlier programs wrote them: each of its patches lies in one of each grid now."""
+    known = KnownPatches(
+        keys=np.array([[0, 0, 0, 0, 1, 0], [3, 0, 0, 0, 1, 0]]),
+        positions=np.array([[0.07, 0.01, 0.05], [0.5, 0.01, 0.05]]),
+        normals=np.array([[0.0, 1.0, 0.0]] * 2),
+        logarithms=np.log([[0.2] * 3, [0.4] * 3]),
+        variances=np.array([0.1, 0.2]),
+        clipped=np.array([0.0, 0.5]),
+        weights=np.array([7.0, 3.0]),
+    )
+    patches = Patches.resumed(known)
+    rows = patches.seen
+    order = np.argsort(patches.positions[rows, 0], kind="stable")
+    for name in ("positions", "normals", "logarithms", "variances", "clipped"):
+        expected = np.repeat(getattr(known, name), GRIDS, axis=0)
+        np.testing.assert_allclose(getattr(patches, name)[rows][order], expected, atol=1e-12)
+    assert (patches.weights[rows] == 7.0).all()
+    assert set(patches.keys[rows, -1].tolist()) == set(range(GRIDS))
 
 
 def test_a_patch_never_weighs_more_than_its_memory() -> None:
@@ -208,17 +246,17 @@ def test_a_patch_never_weighs_more_than_its_memory() -> None:
 
 def test_memory_is_bounded_and_keeps_what_was_seen_last() -> None:
     patches = Patches()
-    places = PATCH_M * (np.stack(np.meshgrid(np.arange(60), [0], np.arange(60)), -1).reshape(-1, 3) + 0.5)
-    for start in range(0, len(places), 300):
-        patches.add(one(places[start : start + 300], 0.5))
+    places = PATCH_M * (np.stack(np.meshgrid(np.arange(60), [0], np.arange(64)), -1).reshape(-1, 3) + 0.25)
+    for start in range(0, len(places), 256):
+        patches.add(one(places[start : start + 256], 0.5))
     kept = patches.positions[patches.weights > 0]
     assert len(kept) == MOST_PATCHES
-    last = places[-MOST_PATCHES:]
+    last = places[-MOST_PATCHES // GRIDS :]
     assert {tuple(p) for p in np.round(last, 6)} >= {tuple(p) for p in np.round(kept, 6)}
 
 
 def test_a_picture_of_more_patches_than_there_is_room_for_fills_it() -> None:
-    patches, places = Patches(), PATCH_M * (np.arange(3 * (MOST_PATCHES + 500)).reshape(-1, 3) + 0.5)
+    patches, places = Patches(), PATCH_M * (np.arange(3 * (MOST_PATCHES + 500)).reshape(-1, 3) + 0.25)
     patches.add(one(places, 0.5))
     assert (patches.weights == 1).all()
     np.testing.assert_allclose(patches.logarithms, np.log(0.5))

@@ -12,6 +12,7 @@ from tests.scenes.shell_room import UP
 
 PLACE = np.stack(np.meshgrid(np.arange(0.05, 2, 0.15), np.arange(0.05, 2, 0.15)), -1).reshape(-1, 2)
 FLOOR = np.column_stack([PLACE, np.zeros(len(PLACE))])
+PATCH_M2 = PATCH_M**2
 INTO_ROOM = np.array([1.0, 0.0, 0.0])
 """From the side of low x."""
 
@@ -21,7 +22,7 @@ def closed_by(wall: Floats, facing: Floats = INTO_ROOM, beside: Floats | None = 
     others = FLOOR if beside is None else np.concatenate([FLOOR, beside])
     facings = np.broadcast_to(facing, wall.shape), np.tile(UP, (len(others), 1))
     points, normals = np.concatenate([wall, others]), np.concatenate(facings)
-    return float(closed_sides(points, normals, np.eye(3), PATCH_M)[0])
+    return float(closed_sides(points, normals, np.eye(3), PATCH_M2)[0])
 
 
 def patches_at(x_m: float, count: int) -> Floats:
@@ -32,16 +33,16 @@ def test_scanned_walls_close_their_sides() -> None:
     """And bring the box from behind the camera to the wall; what faces out of the room closes nothing."""
     wall = patches_at(0.0, len(PLACE))
     points, normals = np.concatenate([wall, FLOOR]), np.repeat([INTO_ROOM, UP], len(PLACE), axis=0)
-    np.testing.assert_array_equal(closed_sides(points, normals, np.eye(3), PATCH_M), [1, 0, 0, 0, 1, 0])
-    np.testing.assert_array_equal(closed_sides(points, -normals, np.eye(3), PATCH_M), np.zeros(6))
-    on_a_table = closed_sides(points, normals, np.eye(3), PATCH_M, has_walls=False)
+    np.testing.assert_array_equal(closed_sides(points, normals, np.eye(3), PATCH_M2), [1, 0, 0, 0, 1, 0])
+    np.testing.assert_array_equal(closed_sides(points, -normals, np.eye(3), PATCH_M2), np.zeros(6))
+    on_a_table = closed_sides(points, normals, np.eye(3), PATCH_M2, has_walls=False)
     np.testing.assert_array_equal(on_a_table, [0, 0, 0, 0, 1, 0])
     some = np.arange(len(wall) - 1, len(points))  # all of the floor, and one patch of wall
-    assert 0 < closed_sides(points[some], normals[some], np.eye(3), PATCH_M)[0] < 0.3
+    assert 0 < closed_sides(points[some], normals[some], np.eye(3), PATCH_M2)[0] < 0.3
     camera, to_wall = np.array([[0.3, 1.0, 1.5]]), np.array([[-1.0, 0.0, 0.0]])
     behind_m = BEHIND_M + CAMERA_M
     for facing, has_walls, distance_m in ((normals, True, 0.3), (-normals, True, behind_m), (normals, False, behind_m)):
-        shell = shell_around(points, facing, camera, UP, PATCH_M, None, has_walls=has_walls)
+        shell = shell_around(points, facing, camera, UP, PATCH_M2, None, has_walls=has_walls)
         assert shell.distances(camera, to_wall).min() == pytest.approx(distance_m, abs=0.01)
 
 

@@ -12,9 +12,9 @@ SIDE = 12
 
 
 def wall() -> NDArray[np.int64]:
-    """Keys [SIDE^2, 6] of a wall x = 0."""
+    """Keys [SIDE^2, 7] of a wall x = 0."""
     place = np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE), indexing="ij"), -1).reshape(-1, 2)
-    return np.column_stack([np.zeros(len(place), int), place, np.ones(len(place), int), np.zeros((len(place), 2), int)])
+    return np.column_stack([np.zeros(len(place), int), place, np.ones(len(place), int), np.zeros((len(place), 3), int)])
 
 
 def looks(level: Floats) -> Floats:
@@ -44,13 +44,14 @@ def test_red_paint_is_another_surface() -> None:
     assert len(np.unique(segments(keys, seen))) == 2
 
 
-def test_neither_other_facings_nor_gaps_are_crossed() -> None:
+def test_neither_facings_nor_gaps_nor_grids_are_crossed() -> None:
     keys = wall()
     floor = keys.copy()
-    floor[:, 3:] = 0, 0, 1
-    away = keys + np.array([0, SIDE + 1, 0, 0, 0, 0])
-    found = segments(np.concatenate([keys, floor, away]), looks(np.zeros(3 * len(keys))))
-    assert len(np.unique(found)) == 3
+    floor[:, 3:6] = 0, 0, 1
+    away = keys + np.array([0, SIDE + 1, 0, 0, 0, 0, 0])
+    other_grid = keys + np.array([0, 0, 0, 0, 0, 0, 1])
+    found = segments(np.concatenate([keys, floor, away, other_grid]), looks(np.zeros(4 * len(keys))))
+    assert len(np.unique(found)) == 4
 
 
 def test_alone_each_is_its_own() -> None:

@@ -22,6 +22,7 @@ from server.light.shell.shell import (
     upright,
     wall_axes,
 )
+from server.light.shell.solver import LEAST_PATCHES
 from server.light.shell.sources import distant_sources
 from server.light.shell.switches import Switches
 from server.light.shell.transport import SATURATED, Transport, meet
@@ -194,7 +195,7 @@ def spoilt(case: str) -> ShellRoom:
     elif case == "seen from behind":
         patches.arrivals[used, :, 3] *= -1
     elif case == "a speck":
-        patches.weights[used[12:]] = 0.0
+        patches.weights[used[LEAST_PATCHES:]] = 0.0
     elif case == "nothing but surface":
         patches.arrivals[used, :, :3], patches.arrivals[used, :, 3] = KNOWN, 1.0
     room.transport = Transport()
@@ -285,14 +286,14 @@ def test_up_is_as_given_where_nothing_faces_up() -> None:
 
 def test_the_box_holds_scan_cameras_and_a_ceiling() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0.5], [0, 1, 0.2]])
-    shell = shell_around(points, np.tile(UP, (4, 1)), CAMERA[None], UP, PATCH_M, None)
+    shell = shell_around(points, np.tile(UP, (4, 1)), CAMERA[None], UP, PATCH_M**2, None)
     camera = shell.axes @ CAMERA
     assert (shell.low[:2] <= camera[:2] - BEHIND_M + 1e-9).all() or (camera[:2] - BEHIND_M > shell.low[:2]).all()
     assert (shell.high[:2] >= camera[:2] + BEHIND_M - 1e-9).all()
     assert shell.high[2] - shell.floor_m >= LEAST_HEIGHT_M - 1e-9
-    again = shell_around(points + 0.01, np.tile(UP, (4, 1)), CAMERA[None], UP, PATCH_M, shell)
+    again = shell_around(points + 0.01, np.tile(UP, (4, 1)), CAMERA[None], UP, PATCH_M**2, shell)
     assert again is shell  # noise moves nothing
-    grown = shell_around(points, np.tile(UP, (4, 1)), CAMERA[None] + SIZE_M, UP, PATCH_M, shell)
+    grown = shell_around(points, np.tile(UP, (4, 1)), CAMERA[None] + SIZE_M, UP, PATCH_M**2, shell)
     assert (grown.high[:2] > shell.high[:2]).all()
     assert (grown.low[:2] <= camera[:2] - BEHIND_M + 0.1).all()  # the first camera's place is remembered
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.light.shell import weights as constants
+from server.light.shell.patches import GRIDS
 from server.light.shell.shell import neighbours
 
 Floats = NDArray[np.float64]
@@ -31,7 +32,7 @@ def level_objective(
     level [n], material_weights [n, g], surfaces [n], regions [n]; prior, deviation [k] of z; middle: logit
     of albedo about which materials lie.
     """
-    total = 0.0
+    total = 0.0  # of all grids
     logit = material_weights @ materials
     residual = level - np.log(shares @ np.exp(z) + known) - np.log(1 / (1 + np.exp(-logit))) - offsets[surfaces]
     precision = 1 / constants.PATCH_NOISE**2
@@ -40,13 +41,14 @@ def level_objective(
         weight = 1 / constants.REGION_SPREAD**2
         offset = precision * own.sum() / (precision * len(own) + weight)  # the best d_r
         total += precision * ((own - offset) ** 2).sum() / 2 + weight * offset**2 / 2
+    edge = np.where(offsets < 0, constants.DARK_EDGE, constants.BRIGHT_EDGE)
+    total += ((edge / constants.SURFACE_SPREAD) ** 2 * (np.sqrt(1 + (offsets / edge) ** 2) - 1)).sum()
+    total /= GRIDS
     total += (((z - prior) / deviation) ** 2).sum() / 2
     for first, second in neighbours():
         ratio = (z[first] - z[second]) / constants.EDGE
         total += constants.SMOOTHNESS * constants.EDGE**2 * (np.sqrt(1 + ratio**2) - 1)
     total += (((materials - middle) / constants.ALBEDO_SPREAD) ** 2).sum() / 2
-    edge = np.where(offsets < 0, constants.DARK_EDGE, constants.BRIGHT_EDGE)
-    total += ((edge / constants.SURFACE_SPREAD) ** 2 * (np.sqrt(1 + (offsets / edge) ** 2) - 1)).sum()
     return float(total)
 
 
@@ -82,7 +84,7 @@ def chroma_objective(
     brightest [n]: patches of the brightest surface.
     """
     residual = seen - parts @ chroma
-    total = sum(_of_surface(residual[surfaces == f], regions[surfaces == f]) for f in np.unique(surfaces))
+    total = sum(_of_surface(residual[surfaces == f], regions[surfaces == f]) for f in np.unique(surfaces)) / GRIDS
     red, blue = constants.TINT_AXIS
     pull, weight = 1 / constants.CELL_CHROMA**2, 1 / np.array([constants.TINT, constants.TINT_ACROSS]) ** 2
     turned = chroma @ np.array([[red, blue], [blue, -red]])  # along the colours of black bodies, and across

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from server.light.shell.patches import PATCH_M, Patches, hemisphere_weights, ray_directions
+from server.light.shell.patches import Patches, hemisphere_weights, ray_directions
 from server.light.shell.picture import Seen
 from server.light.shell.shell import Shell, shell_around
 from server.light.shell.transport import Transport
@@ -55,12 +55,13 @@ def half_floor_room() -> tuple[Patches, Transport, Shell]:
     arrivals[is_scanned, :3] = radiance[is_scanned]
     arrivals[is_scanned, 3] = np.linalg.norm(ends - at[:, None], axis=-1)[is_scanned]
     shown = np.log(albedo * np.einsum("nm,nmr->nr", hemisphere_weights(facing), radiance))
-    patches, rows = Patches(), np.arange(len(at))
+    patches = Patches()
     patches.add(Seen(at, facing, shown, np.zeros(len(at)), np.zeros(len(at))))
+    rows = patches.seen
     order = np.array([np.abs(at - position).sum(1).argmin() for position in patches.positions[rows]])
     patches.traced_normals[rows], patches.arrivals[rows] = patches.normals[rows], arrivals[order]
     patches.traced_in[rows] = 1
-    shell = shell_around(at, facing, np.stack([CAMERA, SIZE_M - 0.5]), UP, PATCH_M, None)
+    shell = shell_around(at, facing, np.stack([CAMERA, SIZE_M - 0.5]), UP, patches.area_m2, None)
     transport = Transport()
     transport.update(patches, NO_EMITTERS, rows, shell)
     return patches, transport, shell

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from server.light.shell.bright_surface import BrightSurface
 from server.light.shell.evidence import Evidence, evidence_of
 from server.light.shell.objective import Unknowns, step
-from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights, ray_directions
+from server.light.shell.patches import RAYS, Patches, hemisphere_weights, ray_directions
 from server.light.shell.picture import Seen
 from server.light.shell.shell import Shell, closed_sides, shell_around
 from server.light.shell.sources import Sources, distant_sources, near_sources
@@ -65,8 +64,8 @@ class ShellRoom:
 
     def distant(self, *, with_indirect: bool = True) -> Sources:
         """Lobes, and the cells of sides that were scanned."""
-        rows = self.patches.used
-        closed = closed_sides(self.patches.positions[rows], self.patches.normals[rows], self.shell.axes, PATCH_M)
+        rows, area_m2 = self.patches.used, self.patches.area_m2
+        closed = closed_sides(self.patches.positions[rows], self.patches.normals[rows], self.shell.axes, area_m2)
         up = self.shell.axes[2]
         return distant_sources(self.transport, closed, up, self.evidence.rows, with_indirect=with_indirect)
 
@@ -126,13 +125,13 @@ def make_room(
     pictures = _exact_pictures(lamp, ambient, tuple(albedos.items()), tuple(np.asarray(known, float).tolist()))
     at, facing, shown, arrivals = (array.copy() for array in pictures)
     patches = Patches()
-    rows: NDArray[np.int64] = np.arange(len(at))
     patches.add(Seen(at + 1e-4, facing, shown, np.zeros(len(at)), np.zeros(len(at))))
+    rows = patches.seen
     # `add` sorts the patches: bring the rays into its order.
     order = np.array([np.abs(at + 1e-4 - position).sum(1).argmin() for position in patches.positions[rows]])
     patches.traced_normals[rows], patches.arrivals[rows] = patches.normals[rows], arrivals[order]
     patches.traced_in[rows] = 1
-    shell = shell_around(at, facing, np.stack([CAMERA, SIZE_M - 1.0]), UP, PATCH_M, None)
+    shell = shell_around(at, facing, np.stack([CAMERA, SIZE_M - 1.0]), UP, patches.area_m2, None)
     transport = Transport()
     transport.update(patches, NO_EMITTERS, rows, shell)
     return ShellRoom(patches, transport, shell, Unknowns())

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.light.arrivals import RayGroup
-from server.light.shell.patches import MOST_PATCHES, MOST_WEIGHT, Patches
+from server.light.shell.patches import GRIDS, MOST_PATCHES, MOST_WEIGHT, Patches
 from server.light.shell.picture import SeenBright
 from server.light.shell.weights import GIVEN_ALBEDO
 from server.maths.distinct_rows import distinct_rows
@@ -94,7 +94,7 @@ class Emitters:
         apart = ((self.centers[:, None] - patches.positions[rows]) ** 2).sum(axis=-1)
         alike = np.maximum(self.facing @ patches.normals[rows].T, 0.0) ** 2 * np.exp(-apart / (2 * NEARBY_M**2))
         shown = np.exp(patches.logarithms[rows].mean(axis=1))
-        arriving = alike @ shown / (alike.sum(axis=1) + 1.0) / GIVEN_ALBEDO
+        arriving = alike @ shown / (alike.sum(axis=1) + GRIDS) / GIVEN_ALBEDO
         share = arriving / np.maximum(self.radiance.mean(axis=1), 1e-6)
         return np.asarray(self.flatness * np.clip((share - UNLIT) / (LIT - UNLIT), 0.0, 1.0))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lu_factor, lu_solve
+from scipy.linalg import cho_factor, cho_solve
 
 from server.light.shell import weights
 from server.light.shell.elimination import Offsets, Regions, add_smoothness
@@ -43,21 +43,22 @@ def solve_chroma(
         vector += weight * np.outer(sees, seen[brightest].mean(axis=0) - weights.WHITE_CHROMA).astype(np.float32)
     add_smoothness(matrix, pairs, weights.CHROMA_SMOOTHNESS)
     matrix[np.diag_indices_from(matrix)] += 1 / weights.CELL_CHROMA**2
-    across = np.array([weights.TINT_AXIS[1], -weights.TINT_AXIS[0]])
-    return _with_tint(matrix, vector, weights.TINT_AXIS, weights.TINT) + _with_tint(
-        matrix, vector, across, weights.TINT_ACROSS
-    )
+    axes = np.stack([weights.TINT_AXIS, weights.TINT_AXIS[::-1] * [1, -1]], axis=1)  # along black bodies, and across
+    return np.asarray(_with_tints(matrix, vector @ axes, np.array([weights.TINT, weights.TINT_ACROSS])) @ axes.T)
 
 
-def _with_tint(matrix: Singles, vector: Singles, axis: Floats, spread: float) -> Floats:
-    """[k, 2] the part along the unit `axis` [2] of chroma u, where all of it lies about the light's own, t.
+def _with_tints(matrix: Singles, vector: Floats, spreads: Floats) -> Floats:
+    """[k, 2] chroma u along two axes, where all of it lies about the light's own, t.
 
-    t is eliminated: along the axis it lies about 0 with standard deviation `spread`.
+    t is eliminated: along the axes it lies about 0 with standard deviations `spreads` [2], and its best value leaves
+    `matrix` less one number throughout, a change of rank 1 (the Sherman-Morrison formula).
     """
     pull = 1 / weights.CELL_CHROMA**2
-    factors = lu_factor(matrix - np.float32(pull**2 / (len(matrix) * pull + 1 / spread**2)), check_finite=False)
-    along = lu_solve(factors, (vector @ axis).astype(np.float32), check_finite=False)
-    return np.outer(along, axis).astype(np.float64)
+    less = pull**2 / (len(matrix) * pull + 1 / spreads**2)
+    right = np.column_stack([vector, np.ones(len(matrix))]).astype(np.float32)
+    solved = cho_solve(cho_factor(matrix, check_finite=False), right, check_finite=False).astype(np.float64)
+    alone, ones = solved[:, :2], solved[:, 2]
+    return np.asarray(alone + np.outer(ones, less * alone.sum(axis=0) / (1 - less * ones.sum())))
 
 
 def _albedo_offsets(regions: Regions, residuals: Floats, *, finds_albedos: bool) -> Offsets:

@@ -2,7 +2,7 @@
 
 An observation of patch p is a row of the design times the unknowns, plus an offset of its surface, plus one of its
 region within the surface. Offsets have Gaussian priors, and each concerns few patches, so the best ones are known in
-closed form given all else.
+closed form given all else. Of the sums over GRIDS grids, of patches and of priors of offsets, the mean counts.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from server.light.shell.evidence import Evidence
+from server.light.shell.patches import GRIDS
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -23,16 +24,16 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Regions:
-    """Weighted sums of the design's columns over the patches, all of them and those of each region."""
+    """Weighted sums of the design's columns over the patches of each region."""
 
     counts: Floats
     """[n] weights of the patches: 1 / variance of their noise."""
+    sizes: Ints
+    """[regions] number of patches, which stand one region after the other."""
     members: csr_matrix
     """[regions, n] the weights of each one's patches."""
     totals: Floats
     """[regions] of weights."""
-    gram: Singles
-    """[c, c] sums of products of two columns."""
     sums: Singles
     """[regions, c] of columns."""
     surfaces: Ints
@@ -43,17 +44,16 @@ class Regions:
         """Of the columns of `design` [n, c] with weights `counts` [n]."""
         starts = np.searchsorted(evidence.regions, np.arange(evidence.regions[-1] + 2))
         members = _members(counts, starts)
-        rooted = design * np.sqrt(counts).astype(np.float32)[:, None]
         totals = np.bincount(evidence.regions, counts).astype(np.float64)
-        return Regions(counts, members, totals, rooted.T @ rooted, members @ design, evidence.surfaces[starts[:-1]])
+        return Regions(counts, np.diff(starts), members, totals, members @ design, evidence.surfaces[starts[:-1]])
 
     def columns(self, count: int, weight: float) -> Regions:
         """The same for the first `count` columns, with weights `weight` times as great."""
         return Regions(
             weight * self.counts,
+            self.sizes,
             self.members * np.float32(weight),
             weight * self.totals,
-            np.float32(weight) * self.gram[:count, :count],
             np.float32(weight) * self.sums[:, :count],
             self.surfaces,
         )
@@ -86,21 +86,32 @@ class Offsets:
 
     def normal_equations(self, design: Singles, residuals: Floats) -> tuple[Singles, Singles]:
         """[c, c] and [c, m]: matrix and vector of `design` [n, c] for residuals [n, m] from which `center` was taken,
-        without the offsets."""
+        without the offsets.
+
+        With the share a of a region's sums taken from each of its patches, products of what is left sum to
+        sum_p w_p x_p y_p - (2 a - a^2 W) (sum_p w_p x_p) (sum_p w_p y_p), W the region's total of weights w_p.
+        """
         regions, several = self.regions, self._has_several
         keeps, alone = self.keeps, ~several[self.regions.surfaces]
         factor = self.of_region * keeps + np.where(alone, self.factor[regions.surfaces] * keeps**2, 0.0)
+        taken = factor / (1 + np.sqrt(1 - regions.totals * factor))  # the a whose 2 a - a^2 W is `factor`
         differences = regions.sums_of(residuals)
-        weighted = (regions.counts[:, None] * residuals).astype(np.float32)
-        root = regions.sums * np.sqrt(factor).astype(np.float32)[:, None]
-        matrix = regions.gram - root.T @ root
-        vector = design.T @ weighted - regions.sums.T @ (factor[:, None] * differences).astype(np.float32)
-        of_surfaces, of_several = self._sums(regions.sums)[several], self.factor[several]
-        root = of_surfaces * np.sqrt(of_several).astype(np.float32)[:, None]
-        matrix -= root.T @ root
-        of_differences = of_several[:, None] * self._sums(differences)[several]
-        vector -= of_surfaces.T @ of_differences.astype(np.float32)
-        return matrix, vector
+        left = self._less(design, regions.sums, taken)
+        matrix = left.T @ left
+        vector = left.T @ self._less(residuals.astype(np.float32), differences, taken)
+        root, of_surfaces = np.sqrt(self.factor[several])[:, None], self._sums(regions.sums)[several]
+        of_surfaces *= root.astype(np.float32)
+        matrix -= of_surfaces.T @ of_surfaces
+        vector -= of_surfaces.T @ (root * self._sums(differences)[several]).astype(np.float32)
+        return matrix / np.float32(GRIDS), vector / np.float32(GRIDS)
+
+    def _less(self, values: Singles, sums: NDArray[Any], taken: Floats) -> Singles:
+        """[n, c] the roots of the weights times: `values` [n, c] less the share `taken` of their regions' `sums`."""
+        regions = self.regions
+        left = np.repeat((-taken[:, None] * sums).astype(np.float32), regions.sizes, axis=0)
+        left += values
+        left *= np.sqrt(regions.counts).astype(np.float32)[:, None]
+        return left
 
     def of_surfaces(self, residuals: Floats) -> Floats:
         """[surfaces, ...] the best offsets of surfaces, for residuals [n, ...] from which `center` was taken."""

@@ -17,7 +17,7 @@ class KnownPatches:
     """The patches of a room, see Patches; n of them."""
 
     keys: NDArray[np.int64]
-    """[n, 6]."""
+    """[n, 7]; in saves of programs with one grid, [n, 6]."""
     positions: Floats
     normals: Floats
     logarithms: Floats
@@ -27,7 +27,7 @@ class KnownPatches:
     weights: Floats
     """[n] each."""
     side_m: float = 0.15
-    """Of the grid's cells. Saves of earlier programs do not tell it: it was this one."""
+    """Of the grids' cells. Saves of earlier programs do not tell it: it was this one."""
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lu_factor, lu_solve
+from scipy.linalg import cho_factor, cho_solve
 
 from server.light.shell import weights
 from server.light.shell.chroma import solve_chroma
@@ -98,10 +98,8 @@ class Unknowns:
     """[k, 3] RGB of the sources."""
     curvature: Singles = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """[k + albedos] squared: half the second derivative of the objective at the last step, sources first."""
-    factors: tuple[Singles, NDArray[np.int32]] = field(
-        default_factory=lambda: (np.zeros((0, 0), np.float32), np.zeros(0, np.int32))
-    )
-    """Of the curvature (LU), and their order."""
+    factor: tuple[Singles, bool] = field(default_factory=lambda: (np.zeros((0, 0), np.float32), False))
+    """Of the curvature (Cholesky), and whether it is the lower triangle."""
     step: float = float("inf")
     """By how much the last step changed the logarithm of what patches receive, root mean square."""
 
@@ -134,8 +132,8 @@ class Unknowns:
     def solve(self, curvature: Singles, right: Floats) -> Floats:
         """[k + albedos] the whole Gauss-Newton step; keeps the curvature."""
         self.curvature = curvature
-        self.factors = lu_factor(self.curvature, check_finite=False)
-        return lu_solve(self.factors, right.astype(np.float32), check_finite=False).astype(np.float64)  # type: ignore[no-any-return]
+        self.factor = cho_factor(self.curvature, check_finite=False)
+        return cho_solve(self.factor, right.astype(np.float32), check_finite=False).astype(np.float64)  # type: ignore[no-any-return]
 
     def solved(self, count: int | None = None) -> Solved:
         """What it tells of all sources, with the covariance of the first `count`; None: of all."""
@@ -143,7 +141,7 @@ class Unknowns:
             return Solved(np.zeros((0, 3)), np.zeros((0, 0), np.float32), float("inf"), self.mean, self.step)
         count = self.known if count is None else count
         right = np.eye(len(self.curvature), count, dtype=np.float32)
-        inverse = lu_solve(self.factors, right, check_finite=False)
+        inverse = cho_solve(self.factor, right, check_finite=False)
         condition = _norm(self.curvature) * _norm(inverse)  # LAPACK's estimate has other last bits in each run
         return Solved(self.radiance, inverse[:count], condition, self.mean, self.step)
 

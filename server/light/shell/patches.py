@@ -1,7 +1,8 @@
 """Evidence about a room's light: what small patches of its surface show, and what reaches each of them.
 
-A patch is what one cell of a grid in the world holds of surface that faces one way. Frames add to it, so memory follows
-the surface that was seen, not the number of frames. Kernel: arrivals.cl.
+A patch is what one cell of a grid in the world holds of surface that faces one way; all surface lies in a patch of each
+of GRIDS grids. Frames add to it, so memory follows the surface that was seen, not the number of frames. Kernel:
+arrivals.cl.
 """
 
 from __future__ import annotations
@@ -20,8 +21,12 @@ from server.maths.distinct_rows import distinct_rows
 from server.maths.sh import in_bundles, spherical_fibonacci
 
 PATCH_M = 0.15
-"""Side of the grid's cells in a room. Shading changes little within one, except at contacts; a room has about 1000
-patches."""
+"""Side of a grid's cells in a room. Shading changes little within one, except at contacts; a room has about 1000
+patches in each grid."""
+GRIDS = 2
+"""Grids, shifted against each other by an even part of a cell along each axis. Where the cells of one lie only the
+origin of the world decides, and with another the light of the real kitchen turned by up to 10 degrees, for the mean of
+two grids by 2.5 (docs/light_experiments.md). More are not affordable: a solution takes as long as it has patches."""
 ROOM_M = 2.0
 """Diagonal of the smallest scan that is a room, or a corner of one. What is smaller is a table with things on it, of
 which a patch must not hold a whole one: with PATCH_M the light of the stage set, 1.5 m across, errs by 16 degrees, with
@@ -34,7 +39,7 @@ LEAST_VOXELS = 4.0
 REGION_M = 0.4
 """Side of the regions over which a material may differ from what its colour says (objective.py), beside patches of
 PATCH_M; beside smaller ones as much smaller."""
-MOST_PATCHES = 1536
+MOST_PATCHES = 1536 * GRIDS
 """Beyond this number a new patch replaces the one that was not seen for longest. One picture shows an eighth of it."""
 RAYS = 1024
 """Directions, evenly spread and the same for all patches, of which half are above the plane of each. With a quarter of
@@ -52,6 +57,8 @@ _CHANGED_BY_FRAMES = (
 )
 _FREE = -1  # number of a row without a patch
 _FACINGS = 1.2  # normals are rounded to multiples of 1 / 1.2: 26 ways to face
+_KEY = 7  # numbers in a key
+_CELL_BITS = 18  # 131 072 cells to either side: 19 km in a room
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -78,19 +85,19 @@ class Patches:
     """The patches of a room, in rows 0 to `count` of its arrays."""
 
     def __init__(self, side_m: float = PATCH_M) -> None:
-        """`side_m`: of the grid's cells."""
+        """`side_m`: of the grids' cells."""
         n = MOST_PATCHES
         self.side_m = side_m
         self._numbers = np.full(n, _FREE)
-        """_key_numbers of the patch in each row."""
+        """key_numbers of the patch in each row."""
         self.weights = np.zeros(n)
         """Frames in the mean; 0: a row without a patch."""
         self.positions, self.normals, self.logarithms = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
         self.variances, self.clipped = np.zeros(n), np.zeros(n)
-        self.keys = np.zeros((n, 6), np.int64)
-        """Cell of the grid and rounded normal."""
+        self.keys = np.zeros((n, _KEY), np.int64)
+        """Cell of the grid, rounded normal, and number of the grid."""
         self.regions = np.zeros(n, np.int64)
-        """Which region each lies in: equal numbers, the same one."""
+        """Which region of its grid each lies in: equal numbers, the same one."""
         self.seen_in, self.traced_in = np.full(n, -1), np.full(n, -1)
         """Number of the last frame that showed it, or in which its rays were traced; -1: none."""
         self.arrivals = np.zeros((n, RAYS, 4), np.float32)
@@ -111,7 +118,7 @@ class Patches:
     def changes(self, seen: Seen) -> tuple[Floats, Ints]:
         """[k] log of the mean radiance of the patches of a picture over what they showed before, and which face alike.
 
-        Equal numbers [k], from 0: patches that face one way.
+        Equal numbers [k], from 0: patches of one grid that face one way.
         """
         keys, mean = self._groups(seen)
         rows = self._known_rows(keys)
@@ -155,6 +162,11 @@ class Patches:
         return self.side_m >= PATCH_M
 
     @property
+    def area_m2(self) -> float:
+        """Surface that each patch stands for."""
+        return self.side_m**2 / GRIDS
+
+    @property
     def is_empty(self) -> bool:
         """Whether it has no patch yet."""
         return bool(np.all(self._numbers == _FREE))
@@ -192,14 +204,7 @@ class Patches:
 
     def grown(self, side_m: float) -> Patches:
         """The same with cells of `side_m`, all as old as the oldest; their rays are not traced yet."""
-        rows = self.seen
-        larger = Patches(side_m)
-        seen = Seen(
-            self.positions[rows], self.normals[rows], self.logarithms[rows], self.variances[rows], self.clipped[rows]
-        )
-        larger.add(seen)
-        larger.weights[larger.seen] = self.weights[rows].max(initial=0.0)
-        return larger
+        return _in_cells_of(side_m, self.known())
 
     @property
     def seen(self) -> Ints:
@@ -220,15 +225,16 @@ class Patches:
             self.side_m,
         )
 
-    def resume(self, known: KnownPatches) -> None:
+    @staticmethod
+    def resumed(known: KnownPatches) -> Patches:
         """Begin with these, at most MOST_PATCHES; their rays are traced with the next."""
-        rows = self._rows_of(known.keys)
-        self.positions[rows], self.normals[rows], self.logarithms[rows] = (
-            known.positions,
-            known.normals,
-            known.logarithms,
-        )
-        self.variances[rows], self.clipped[rows], self.weights[rows] = known.variances, known.clipped, known.weights
+        if known.keys.shape[1] < _KEY:  # saved by an earlier program, with one grid
+            return _in_cells_of(known.side_m, known)
+        patches = Patches(known.side_m)
+        rows = patches._rows_of(known.keys)
+        for name in ("positions", "normals", "logarithms", "variances", "clipped", "weights"):
+            getattr(patches, name)[rows] = getattr(known, name)
+        return patches
 
     def _groups(self, seen: Seen) -> tuple[Ints, _Means]:
         """As of _grouped."""
@@ -238,7 +244,7 @@ class Patches:
 
     def _known_rows(self, keys: Ints) -> Ints:
         """Rows of patches by key, -1 for those that are not there."""
-        numbers, order = _key_numbers(keys), np.argsort(self._numbers)
+        numbers, order = key_numbers(keys), np.argsort(self._numbers)
         rows = order[np.minimum(np.searchsorted(self._numbers, numbers, sorter=order), MOST_PATCHES - 1)]
         return np.where(self._numbers[rows] == numbers, rows, -1)
 
@@ -250,7 +256,7 @@ class Patches:
         free = np.flatnonzero(self._numbers == _FREE)[: len(new)]
         new = new[: len(free)]
         rows[new] = free
-        self._numbers[free] = _key_numbers(keys[new])
+        self._numbers[free] = key_numbers(keys[new])
         self.weights[free], self.traced_in[free] = 0.0, -1
         self.keys[free], self.regions[free] = keys[new], _region_numbers(keys[new])
         return rows
@@ -267,35 +273,46 @@ class Patches:
         self.weights[forgotten], self._numbers[forgotten] = 0.0, _FREE
 
 
-def _key_numbers(keys: Ints) -> Ints:
-    """[n] a number for each key [n, 6], distinct within 131 072 cells: 19 km in a room."""
-    cells = (keys[:, :3] + (1 << 17)) @ (1 << (18 * np.arange(3, dtype=np.int64)))
-    return np.asarray((cells << 6) + (keys[:, 3:] + 1) @ np.array([1, 4, 16]))
+def key_numbers(keys: Ints) -> Ints:
+    """[n] a number for each key [n, 7], distinct within 2^_CELL_BITS cells along each axis."""
+    cells = (keys[:, :3] + (1 << _CELL_BITS - 1)) @ (1 << (_CELL_BITS * np.arange(3, dtype=np.int64)))
+    return np.asarray((cells * GRIDS + keys[:, 6] << 6) + (keys[:, 3:6] + 1) @ np.array([1, 4, 16]))
 
 
 def _region_numbers(keys: Ints) -> Ints:
-    """[n] a number for each region of patches, by their keys [n, 6]."""
+    """[n] a number for each region of patches, by their keys [n, 7]."""
     cells = np.floor(keys[:, :3] * (PATCH_M / REGION_M)).astype(np.int64)
-    parts = np.concatenate([cells, keys[:, 3:]], axis=1) + (1 << 9)
-    return np.asarray(parts @ (1 << (10 * np.arange(6, dtype=np.int64))))
+    return key_numbers(np.concatenate([cells, keys[:, 3:]], axis=1))
 
 
 def _grouped(seen: Seen, side_m: float) -> tuple[Ints, _Means]:
-    """Keys of the patches in a picture, [k, 6] distinct, and means over what it shows of each."""
-    cells = np.floor(seen.positions / side_m).astype(np.int64)
+    """Keys of the patches in a picture, [k, 7] distinct, and means over what it shows of each."""
+    shift = np.arange(GRIDS)[:, None, None] / GRIDS
+    cells = np.floor(seen.positions / side_m + shift).astype(np.int64)
     facing = np.rint(seen.normals * _FACINGS).astype(np.int64)
-    keys, inverse = distinct_rows(np.concatenate([cells, facing], axis=1))
+    grid = np.repeat(np.arange(GRIDS), seen.count)
+    keys, inverse = distinct_rows(np.column_stack([cells.reshape(-1, 3), np.tile(facing, (GRIDS, 1)), grid]))
     return keys, _Means(inverse, np.bincount(inverse, minlength=len(keys)).astype(np.float64))
 
 
+def _in_cells_of(side_m: float, known: KnownPatches) -> Patches:
+    """The known ones put together to patches of cells of `side_m`, all as old as the oldest; not traced yet."""
+    patches, rows = Patches(side_m), np.flatnonzero(known.weights > 0)
+    turned = known.positions[rows], known.normals[rows], known.logarithms[rows]
+    patches.add(Seen(*turned, known.variances[rows], known.clipped[rows]))
+    patches.weights[patches.seen] = known.weights.max(initial=0.0)
+    return patches
+
+
 class _Means:
-    """Means over groups of equal number."""
+    """Means over groups of equal number, in each of GRIDS."""
 
     def __init__(self, groups: Ints, counts: Floats) -> None:
         self._groups, self._counts = groups, counts
 
     def of(self, values: Floats) -> Floats:
         """[groups, k] of values [n, k]."""
+        values = np.tile(values, (GRIDS, 1))
         columns = [np.bincount(self._groups, column, len(self._counts)) for column in values.T]
         return np.asarray(np.stack(columns, axis=1) / self._counts[:, None])
 

@@ -218,8 +218,7 @@ class RoomModel:
 
     def resume(self, known: KnownRoom) -> None:
         """Go on from there, with the next frame."""
-        self._patches = Patches(known.patches.side_m)
-        self._patches.resume(known.patches)
+        self._patches = Patches.resumed(known.patches)
         self._begun_with = known.shell
         self._solver.begin_with(known.shell)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from server.light.shell.patches import key_numbers
+
 LEVEL_EDGE = 0.7
 """If the mean logarithms of neighbouring patches differ by more than this, paint has an edge there, and not shading:
 over the 15 cm between them, light falls to half only beside a lamp or in the rim of a shadow."""
@@ -20,26 +22,22 @@ Ints = NDArray[np.int64]
 def segments(keys: Ints, colors: Floats) -> Ints:
     """[n] from 0: which surface each patch is part of.
 
-    keys: [n, 6] cell of a grid and rounded normal, all different; colors: [n, 3] mean logarithm and chroma.
+    keys: [n, 7] as in Patches, all different; colors: [n, 3] mean logarithm and chroma.
     """
-    number = _numbers(keys)
-    order = np.argsort(number)
+    order = np.argsort(key_numbers(keys))
+    keys = keys[order]
+    number = key_numbers(keys)
     first, second = [], []
     for offset in _OFFSETS:
-        wanted = _numbers(keys + np.concatenate([offset, np.zeros(3, np.int64)]))
-        place = np.minimum(np.searchsorted(number[order], wanted), len(keys) - 1)
-        found = number[order][place] == wanted
-        first.append(np.flatnonzero(found))
+        wanted = key_numbers(keys + np.pad(offset, (0, keys.shape[1] - 3)))
+        place = np.minimum(np.searchsorted(number, wanted), len(keys) - 1)
+        found = number[place] == wanted
+        first.append(order[found])
         second.append(order[place[found]])
     one, other = np.concatenate(first), np.concatenate(second)
     apart = np.abs(colors[one] - colors[other])
     is_alike = (apart[:, 0] < LEVEL_EDGE) & (apart[:, 1:].max(axis=1) < CHROMA_EDGE)
     return _components(len(keys), one[is_alike], other[is_alike])
-
-
-def _numbers(keys: Ints) -> Ints:
-    """[n] one number for each of `keys` [n, 6]."""
-    return np.asarray((keys + (1 << 9)) @ (1 << (10 * np.arange(6, dtype=np.int64))))
 
 
 def _components(count: int, one: Ints, other: Ints) -> Ints:

@@ -167,11 +167,14 @@ def wall_axes(normals: Floats, up: Floats) -> Floats:
     return np.stack([along, np.cross(up, along), up])
 
 
-def closed_sides(positions: Floats, normals: Floats, axes: Floats, patch_m: float, *, has_walls: bool = True) -> Floats:
+def closed_sides(
+    positions: Floats, normals: Floats, axes: Floats, patch_m2: float, *, has_walls: bool = True
+) -> Floats:
     """[SIDES] how far each side of a room is scanned wall, from 0, open, to 1; no patch changes it by a jump.
 
-    positions, normals: [n, 3] of patches of side `patch_m`, world; a side is closed by those at the end of the scan
-    that face into the room. has_walls: else upright surface is of things on a table, and closes nothing.
+    positions, normals: [n, 3] of patches, world, that stand for `patch_m2` of surface each; a side is closed by those
+    at the end of the scan that face into the room. has_walls: else upright surface is of things on a table, and closes
+    nothing.
     """
     surface, facing = positions @ axes.T, normals @ axes.T
     closed = np.zeros(SIDES)
@@ -182,7 +185,7 @@ def closed_sides(positions: Floats, normals: Floats, axes: Floats, patch_m: floa
         is_wall = _step((inward - INWARD[0]) / (INWARD[1] - INWARD[0]))
         if is_wall.any() and (has_walls or axis == 2):
             is_wall *= _step(2 - _share_behind(place) / BEHIND_WALL)
-            closed[side] = _step(is_wall.sum() * patch_m**2 / CLOSED_M2)
+            closed[side] = _step(is_wall.sum() * patch_m2 / CLOSED_M2)
     return closed
 
 
@@ -213,14 +216,14 @@ def shell_around(
     normals: Floats,
     cameras: Floats,
     up: Floats,
-    patch_m: float,
+    patch_m2: float,
     before: Shell | None,
     *,
     has_walls: bool = True,
 ) -> Shell:
     """The shell around `positions` [n, 3] of surface and `cameras` [m, 3], world metres.
 
-    before: the last one, returned unless the shell has changed by more than noise makes. patch_m, has_walls: see
+    before: the last one, returned unless the shell has changed by more than noise makes. patch_m2, has_walls: see
     closed_sides.
     """
     axes = wall_axes(normals, upright(normals, up)) if before is None else before.axes
@@ -229,7 +232,7 @@ def shell_around(
     seen_from = cameras @ axes.T
     if before is not None:
         seen_from = np.concatenate([seen_from, before.cameras])
-    open_share = 1.0 - closed_sides(positions, normals, axes, patch_m, has_walls=has_walls).reshape(3, 2).T
+    open_share = 1.0 - closed_sides(positions, normals, axes, patch_m2, has_walls=has_walls).reshape(3, 2).T
     reach = CAMERA_M + np.array([BEHIND_M, BEHIND_M, 0.0]) * open_share
     seen = np.stack([seen_from.min(0), seen_from.max(0)])
     low, high = np.minimum(low, seen[0] - reach[0]), np.maximum(high, seen[1] + reach[1])

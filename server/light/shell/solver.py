@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from server.light.shell.bright_surface import EmittersSeen
 from server.light.shell.evidence import Evidence, evidence_of
 from server.light.shell.objective import Unknowns, received, step
-from server.light.shell.patches import Patches
+from server.light.shell.patches import GRIDS, Patches
 from server.light.shell.shell import Shell, closed_sides, shell_around
 from server.light.shell.solution import Solution
 from server.light.shell.sources import Sources, distant_sources, near_sources
@@ -39,7 +39,7 @@ solution has settled while its last step's is: half a per cent is less than a co
 CHROMA_MOVED = 0.05
 """While a step changes what patches receive by no more than this, the light keeps the colours that a solution's first
 step found: they follow the level slowly, and take a third of a step's time."""
-LEAST_PATCHES = 12
+LEAST_PATCHES = 12 * GRIDS
 """With fewer patches there is no solution."""
 
 Floats = NDArray[np.float64]
@@ -79,10 +79,10 @@ class Solver:
         if side_m != self._side_m:  # they were put together
             self._begin_anew(side_m)
         self._shell = shell = shell_around(
-            positions, normals, camera[None], up, side_m, self._shell, has_walls=has_walls
+            positions, normals, camera[None], up, patches.area_m2, self._shell, has_walls=has_walls
         )
         self._transport.update(patches, bright, traced, shell)
-        closed = closed_sides(positions, normals, shell.axes, side_m, has_walls=has_walls)
+        closed = closed_sides(positions, normals, shell.axes, patches.area_m2, has_walls=has_walls)
         evidence = evidence_of(patches, rows, switches)
         near = near_sources(self._transport, shell, patches, evidence.rows)
         distant = distant_sources(

@@ -44,9 +44,8 @@ def test_the_chroma_is_a_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
         moves = [sign * 0.05 * np.outer(np.eye(len(unknowns.chroma))[cell], (1.0, 0.0)) for sign in (-1, 1)]
         lower, higher = (value(unknowns.chroma + move) for move in moves)
         slope, bend = (higher - lower) / 0.1, (higher + lower - 2 * best) / 0.05**2
-        assert (
-            abs(slope / bend) < 0.01
-        )  # seen: .007, as the width that a region has is taken from an offset that is not yet shrunk
+        # Seen: .007. What a region has beyond its surface's sets the width of its prior before that has shrunk it.
+        assert abs(slope / bend) < 0.01
 
 
 def test_a_cast_is_the_lights_sooner_if_it_is_like_a_black_bodys(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,7 +46,7 @@ from server.light.shell import weights
 from server.light.shell.chroma import solve_chroma
 from server.light.shell.elimination import Offsets, Regions, add_smoothness
 from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, log_chroma, materials_of
-from server.light.shell.patches import MOST_PATCHES
+from server.light.shell.patches import GRIDS, MOST_PATCHES
 from server.light.shell.shell import CELLS, FLOOR
 from server.light.shell.solved import Solved
 from server.light.shell.sources import Sources
@@ -274,7 +274,8 @@ def _set_floor_prior(
         return
     floor, others = albedos[is_usable & sources.floor.is_scanned], albedos[is_usable]
     of_room = others.sum() / max(len(others), 1)
-    albedo = (floor.sum() + weights.FLOOR_PATCHES * of_room) / (len(floor) + weights.FLOOR_PATCHES)
+    of_all = GRIDS * weights.FLOOR_PATCHES
+    albedo = (floor.sum() + of_all * of_room) / (len(floor) + of_all)
     prior[FLOOR] = np.log(np.maximum(sources.floor.shares @ level[:CELLS], DARKEST)) + albedo
 
 

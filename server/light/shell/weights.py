@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from server.light.shell.patches import GRIDS
-
 MEAN_ALBEDO, MEAN_SPREAD = 0.33, 0.3
 """Mean reflectance of a room's materials, with furniture and floors, and the standard deviation of its logit from
 room to room: two thirds lie from .27 to .4."""
@@ -56,9 +54,9 @@ CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.47, 2.9, 0.7
 show is surface like it: of the shell below the height of windows and lamps and above it (a lamp is 100 times as
 bright), and of surface that was not seen. Of floor, about what it sends back of the light that arrives there. The
 first two are of cells of shell.SIDE: a lamp fills more of smaller ones, and each pulls it to the mean."""
-FLOOR_PATCHES = 10 * GRIDS
-"""The mean albedo of all patches counts as so many of floor where that of floor that was not scanned is asked for: a
-fifth of a square metre."""
+FLOOR_PATCHES = 10
+"""The mean albedo of all patches counts as so many of floor in each grid where that of floor that was not scanned is
+asked for: a fifth of a square metre."""
 LOBE, LOBE_SHAPE = 0.4, 0.2
 """Most probable radiance of a distant lobe at the horizon, over the light's mean, as most of a sky is darker than its
 mean; and shape of the gamma distribution of it. A bright lobe costs as its radiance, so that lobes which overlap share

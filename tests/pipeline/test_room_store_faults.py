@@ -271,7 +271,7 @@ def test_a_save_of_another_version_is_set_aside(
 
 
 def test_a_save_of_the_first_version_is_read(device: Device, room: Room, tmp_path: Path) -> None:
-    """It has no places to be told of, its lights no spread, and its patches no side."""
+    """It has no places to be told of, its lights no spread, and its patches no side and one grid."""
     RoomStore(tmp_path).save(room)
     path = next(tmp_path.rglob(slots.SAVE))
     header, packed = read_parts(path)
@@ -279,14 +279,22 @@ def test_a_save_of_the_first_version_is_read(device: Device, room: Room, tmp_pat
     del state["wishes"]["light_at"]
     for light in lights_in(state):
         del light["spread_deg"]
-    del state["light"]["room"]["patches"]["side_m"]
+    patches = state["light"]["room"]["patches"]
+    del patches["side_m"]
+    arrays = {name: np.frombuffer(data, kind).reshape(shape) for name, (kind, shape, data) in patches.items()}
+    is_first = arrays["keys"][:, -1] == 0
+    arrays["keys"] = arrays["keys"][:, :-1]
+    patches |= {name: states.array_to_list(array[is_first]) for name, array in arrays.items()}
     old = msgspec.msgpack.encode(msgspec.msgpack.decode(header) | {"version": 1})
     write_parts(path, [old, zstandard.ZstdCompressor().compress(msgspec.msgpack.encode(state))])
     loaded = RoomStore(tmp_path).load("study", device)
     assert loaded is not None
     assert loaded.wishes.light_at == ()
     assert loaded.light.estimate().spread_deg is None
-    assert loaded.light.known().room.patches.side_m == 0.15
+    resumed = loaded.light.known().room.patches
+    assert resumed.side_m == 0.15
+    assert resumed.keys.shape[1] == 7
+    assert len(resumed.keys) > 1.5 * is_first.sum() > 0
 
 
 def lights_in(value: Any) -> Iterator[dict[str, Any]]:
@@ -312,4 +320,4 @@ LAYOUT = "648ce2ccc95d2633"
 def test_the_version_is_that_of_the_layout() -> None:
     """Where this fails, another layout is written: give it another `VERSION`."""
     layout = hashlib.blake2b(repr(layout_of(states.RoomState)).encode(), digest_size=8).hexdigest()
-    assert (states.VERSION, layout) == (4, LAYOUT)
+    assert (states.VERSION, layout) == (5, LAYOUT)

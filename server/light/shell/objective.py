@@ -18,7 +18,8 @@ Minimised is
     + sum_p |e'_p / S'_p|^2 + sum_k |(u_k - t) / s_u|^2 + sum_(k,l) c |u_k - u_l|^2 + |t / s_t|^2 + sum_f |a_f / s_a|^2
     + sum_r log(1 + |c_r / s_c|^2) + |(w - w_0) / s_w|^2
 
-over lobes j at infinity, all other sources k (all of them in the sums of u), and neighbours (k,l). tau is
+over lobes j at infinity, all other sources k (all of them in the sums of u), and neighbours (k,l); sums over p, f and r
+are divided by GRIDS, each of which has patches of all surface. tau is
 2 (d / s_o)^2 (sqrt(1 + (o / d)^2) - 1), which becomes linear at d, sooner below 0 than above, and steep where the
 albedo exceeds 1. n_k of floor that was not scanned is the log of what the other sources bring there, with nothing in
 between, plus the mean log albedo of floor that was; of all others it is one value, and n_j is another, which grows with

@@ -16,9 +16,9 @@ from server.maths.near_light import Found
 from server.scene.placement import Placement
 from server.tracking.relocalize import Keyframe
 
-VERSION = 4
+VERSION = 5
 """Format version. Increase it when any of these types, or a type that they contain, changes."""
-READABLE = (1, 2, 3, VERSION)
+READABLE = (1, 2, 3, 4, VERSION)
 """Versions that can be read: what came since has a default, and what went is skipped."""
 _MOST_BYTES = 1 << 30
 

@@ -103,16 +103,18 @@ class Transport:
 
     def _update_rays(self, patches: Patches, rows: Ints, shell: Shell) -> None:
         """What evenly spread rays meet, but for saturated surface."""
-        weights = hemisphere_weights(patches.traced_normals[rows])
-        row, ray = np.nonzero(weights)
-        share, arrivals = weights[row, ray], patches.arrivals[rows[row], ray]
-        free = arrivals[:, 3] == 0
-        origins, directions = patches.positions[rows[row[free]]], ray_directions()[ray[free]]
-        columns, corners = shell.exits(origins, directions)
-        sums = _summed(row[free], columns, corners * share[free, None], len(rows))
-        self.beyond[rows] = _beyond(row[free], ray[free], share[free], columns[:, 0], len(rows))
-        row, ray, share, arrivals = row[~free], ray[~free], share[~free], arrivals[~free].astype(np.float64)
-        ends = patches.positions[rows[row]] + np.abs(arrivals[:, 3:]) * ray_directions()[ray]
+        # np.take: four times as fast as an index.
+        weights, positions = hemisphere_weights(patches.traced_normals[rows]), patches.positions[rows]
+        met = patches.arrivals[rows].reshape(-1, 4)
+        above = np.flatnonzero(weights)
+        is_free = np.take(met[:, 3], above) == 0
+        row, ray, share = _of_rays(weights, above[is_free])
+        columns, corners = shell.exits(np.take(positions, row, axis=0), np.take(ray_directions(), ray, axis=0))
+        sums = _summed(row, columns, corners * share[:, None], len(rows))
+        self.beyond[rows] = _beyond(row, ray, share, columns[:, 0], len(rows))
+        row, ray, share = _of_rays(weights, above[~is_free])
+        arrivals = np.take(met, above[~is_free], axis=0).astype(np.float64)
+        ends = np.take(positions, row, axis=0) + np.abs(arrivals[:, 3:]) * np.take(ray_directions(), ray, axis=0)
         back, bright = arrivals[:, 3] < 0, _is_bright(arrivals)
         keys = 2 * _cell_numbers(ends[back], HIDDEN_M)
         self._add_cells(keys, is_saturated=False)
@@ -168,6 +170,12 @@ class Transport:
         share = np.where(total > 0, counts / np.maximum(total, 1.0), 0.0)[:, None]
         self.clipped += share * (sums / np.maximum(counts, 1.0)[:, None] - self.clipped)
         self._counts = np.minimum(total, _MOST_COUNTED)
+
+
+def _of_rays(weights: Floats, chosen: Ints) -> tuple[Ints, Ints, Floats]:
+    """[m] patch and direction, and how far it counts, of `chosen` [m] places in `weights` [patches, RAYS]."""
+    row = chosen // RAYS
+    return row, chosen - RAYS * row, np.take(weights, chosen)
 
 
 def _summed(rows: Ints, columns: Ints, shares: Floats, count: int) -> Floats:

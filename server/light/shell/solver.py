@@ -39,7 +39,7 @@ solution has settled while its last step's is: half a per cent is less than a co
 CHROMA_MOVED = 0.05
 """While a step changes what patches receive by no more than this, the light keeps the colours that a solution's first
 step found: they follow the level slowly, and take a third of a step's time."""
-LEAST_PATCHES = 12 * GRIDS
+LEAST_PATCHES = 10 * GRIDS
 """With fewer patches there is no solution."""
 
 Floats = NDArray[np.float64]

@@ -162,6 +162,15 @@ def test_all_surface_lies_in_a_patch_of_each_grid() -> None:
         )
 
 
+@pytest.mark.parametrize("side_m", [0.075, PATCH_M])
+def test_patches_stand_for_the_surface_that_there_is(side_m: float) -> None:
+    """Each of its parts lies in a patch of each grid, and counts once."""
+    patches, along = Patches(side_m), np.arange(0.005, 3.0, 0.01)
+    x, y = (axis.ravel() for axis in np.meshgrid(along, along))
+    patches.add(one(np.column_stack([x, np.full(x.size, 0.01), y]), 0.5))
+    assert len(patches.seen) * patches.area_m2 == pytest.approx(3.0**2, rel=0.1)  # patches at the rim are parts
+
+
 @pytest.mark.parametrize(
     ("size_m", "voxel_m", "side_m"),
     [

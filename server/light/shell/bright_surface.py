@@ -94,8 +94,8 @@ class Emitters:
         apart = ((self.centers[:, None] - patches.positions[rows]) ** 2).sum(axis=-1)
         alike = np.maximum(self.facing @ patches.normals[rows].T, 0.0) ** 2 * np.exp(-apart / (2 * NEARBY_M**2))
         shown = np.exp(patches.logarithms[rows].mean(axis=1))
-        dark = float(GRIDS)  # as one dark patch of each grid
-        arriving = alike @ shown / (alike.sum(axis=1) + dark) / GIVEN_ALBEDO
+        dark_patches = GRIDS  # far from all patches, no light arrives
+        arriving = alike @ shown / (alike.sum(axis=1) + dark_patches) / GIVEN_ALBEDO
         share = arriving / np.maximum(self.radiance.mean(axis=1), 1e-6)
         return np.asarray(self.flatness * np.clip((share - UNLIT) / (LIT - UNLIT), 0.0, 1.0))
 

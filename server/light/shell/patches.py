@@ -24,9 +24,10 @@ PATCH_M = 0.15
 """Side of a grid's cells in a room. Shading changes little within one, except at contacts; a room has about 1000
 patches in each grid."""
 GRIDS = 2
-"""Grids, shifted against each other by an even part of a cell along each axis. Where the cells of one lie only the
-origin of the world decides, and with another the light of the real kitchen turned by up to 10 degrees, for the mean of
-two grids by 2.5; three are hardly steadier (docs/light_experiments.md). A solution takes as long as it has patches."""
+"""Grids, each shifted by 1 / GRIDS of a cell against the one before, along each axis. Where the cells of one lie only
+the origin of the world decides, and with another the light of the real kitchen turned by up to 10 degrees, for the mean
+of two grids by 2.5; three are hardly steadier (docs/light_experiments.md). A solution takes as long as it has patches.
+"""
 ROOM_M = 2.0
 """Diagonal of the smallest scan that is a room, or a corner of one. What is smaller is a table with things on it, of
 which a patch must not hold a whole one: with PATCH_M the light of the stage set, 1.5 m across, errs by 16 degrees, with

@@ -24,9 +24,9 @@ def segments(keys: Ints, colors: Floats) -> Ints:
 
     keys: [n, 7] as in Patches, all different; colors: [n, 3] mean logarithm and chroma.
     """
-    order = np.argsort(key_numbers(keys))
-    keys = keys[order]
     number = key_numbers(keys)
+    order = np.argsort(number)
+    keys, number = keys[order], number[order]
     first, second = [], []
     for offset in _OFFSETS:
         wanted = key_numbers(keys + np.pad(offset, (0, keys.shape[1] - 3)))

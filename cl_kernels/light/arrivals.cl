@@ -24,7 +24,8 @@ static float3 clear_of_surface(const Volume volume, const float3 point, const fl
 // the surface that a point lies on: rays begin clear of it and directions below its plane are skipped; w = 0: it lies on none;
 // directions [sets][per_set] unit. Point i takes set i % sets.
 // -> arrivals, group by group [count][per_set]: radiance (rgb) of the surface that is met, and its distance in metres (w): positive,
-// surface that was photographed; negative, a back or surface without a colour; 0, nothing is met, or the direction is skipped.
+// surface that was photographed; negative, a back or surface without a colour (rgb 0), or one that only another light showed (rgb its colour
+// then); 0, nothing is met, or the direction is skipped.
 kernel void trace_arrivals(const VolumeShape shape, global const int *slots, global const ulong *solid,
                            global const uchar *octets, global const float2 *voxels, global const uint *colors,
                            const int items, const RayGroup first_group, const RayGroup second_group, const RayGroup third_group,
@@ -66,9 +67,10 @@ kernel void trace_arrivals(const VolumeShape shape, global const int *slots, glo
             const float3 at = origin / volume.voxel_m + met[lane] * direction;
             float4 color = color_at(volume, colors, at);
             if (color.w <= 0.0f) color = color_at(volume, colors, at - direction);  // colours reach 1.5 voxels deep (integrate.cl)
-            const int is_known = color.w > 0.0f && !is_back(volume, at, direction);
+            const int is_front = color.w > 0.0f && !is_back(volume, at, direction);
             const float distance_m = met[lane] * volume.voxel_m;
-            arrival = is_known ? (float4)(color.xyz, distance_m) : (float4)(0.0f, 0.0f, 0.0f, -distance_m);
+            arrival.xyz = is_front ? color.xyz : (float3)(0.0f);
+            arrival.w = is_front && color.w > 1.0f ? distance_m : -distance_m;
         }
         arrivals[lane] = arrival;
     }

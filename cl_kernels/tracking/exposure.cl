@@ -43,14 +43,14 @@ static Around interpolate_around(const int4 bricks, global const int *slots, glo
         const float4 color = unpack_color(colors[index]);
         const float3 share = (float3)(corner.x ? far.x : near.x, corner.y ? far.y : near.y, corner.z ? far.z : near.z);
         const float weight = share.x * share.y * share.z;
-        const float colored = color.w > 0.0f ? weight : 0.0f;
+        const float colored = color.w > 1.0f ? weight : 0.0f;  // at 1, of another light
         result.seen = result.seen && pair.y >= least_weight;
         result.tsdf += weight * pair.x;
         result.slope += pair.x * (float3)(corner.x ? share.y * share.z : -share.y * share.z, corner.y ? share.x * share.z : -share.x * share.z,
                                           corner.z ? share.x * share.y : -share.x * share.y);
         result.luminance += colored * dot(color.xyz, LUMINANCE);
         result.brightest = fmax(result.brightest, fmax(color.x, fmax(color.y, color.z)));
-        result.observations += colored * color.w;
+        result.observations += colored * (color.w - 1.0f);
         result.colored += colored;
     }
     const float scale = result.colored > 0.0f ? 1.0f / result.colored : 0.0f;

@@ -56,7 +56,7 @@ kernel void gather_hits(const GatherParameters p, global const float4 *positions
                 met[sample * p.most + count_met++] = pack_met(number[lane], distance_m[lane]);
                 const float3 direction = directions[chosen[lane]].xyz;
                 const float4 color = color_at(volume, colors, (origin_m + distance_m[lane] * direction) / volume.voxel_m);
-                sum += color.w * dot(normal.xyz, direction) * (float4)(color.xyz, 1.0f);
+                if (color.w > 0.0f) sum += dot(normal.xyz, direction) * (float4)(color.xyz, 1.0f);
             }
             waiting = 0;
         }

@@ -1,5 +1,5 @@
 // The pool of bricks: clearing, placing and copying. Slot 0 represents all bricks on the host, see server/volume/brick_pool.py.
-// Provides place_bricks, copy_bricks.
+// Provides place_bricks, copy_bricks, forget_colors.
 #include "volume.clh"
 
 // listed: the bricks [count] from `first` on, and their new slots [count] behind them -> table [z][y][x]; a brick with NO_SLOT is
@@ -26,4 +26,13 @@ kernel void copy_bricks(const int count, global const int *from, global const fl
     const int source = from[brick] * BRICK * BRICK + row, target = to[brick] * BRICK * BRICK + row;
     vstore16(vload16(source, (global const float *)voxels_from), target, (global float *)voxels_to);
     vstore8(vload8(source, colors_from), target, colors_to);
+}
+
+// colors [slots], see bricks.py: means keep the share `kept` of their weights, rounded. One item a row of 8 voxels.
+kernel void forget_colors(const int slots, const float kept, global uint *colors) {
+    const int row = get_global_id(0);
+    if (row >= slots * BRICK * BRICK) return;
+    const uint8 color = vload8(row, colors), weight = max(color & 63u, 1u) - 1u;
+    const uint8 left = convert_uint8(convert_float8(weight) * kept + 0.5f);
+    vstore8((color & ~63u) | select((uint8)(0), left + 1u, (color & 63u) > 0u), row, colors);
 }

@@ -6,6 +6,7 @@
 #include "radiance_marks.clh"
 #include "volume.clh"
 
+#define MOST_COLOR_WEIGHT 62  // of a mean; 1 more is stored in 6 bits
 #define COLOR_REACH 1.5f  // voxels from the surface: interpolation on the surface reads no colour farther away
 
 // The measured picture.
@@ -43,13 +44,14 @@ static inline intn mean_channel(const intn code, const float most, const floatn 
     return CONVERT_INTN(fmin(next + dice, most));
 }
 
-// Colours of a row of voxels after one more observation, see bricks.py for the packing.
-static inline intn mean_color(const Picture picture, const intn old, const intn pixel, const intn voxel, const int frame) {
+// Colours of a row of voxels after one more observation, see bricks.py for the packing. One of weight 0 is of another light.
+static inline intn mean_color(const Picture picture, const intn before, const intn pixel, const intn voxel, const int frame) {
     const floatn mark = GATHER_FLOATN(picture.radiance, 4 * pixel + 3);
     const intn is_bound = MASK(mark == AT_LEAST);
-    const intn count = old & 63;
-    const intn next_count = min(count + 1, 63);
-    const floatn rate = 1.0f / CONVERT_FLOATN(next_count);
+    const intn weight = max(before & 63, 1) - 1;
+    const intn next_weight = min(weight + 1, MOST_COLOR_WEIGHT);
+    const floatn rate = 1.0f / CONVERT_FLOATN(next_weight);
+    const intn old = weight > 0 ? before : 0;
     uintn h = AS_UINTN(voxel) * 0x9E3779B1u + (uint)frame * 0x85EBCA77u;
     h = (h ^ (h >> 15)) * 0x2C1B3C6Du;
     h = (h ^ (h >> 12)) * 0x297A2D39u;
@@ -61,18 +63,18 @@ static inline intn mean_color(const Picture picture, const intn old, const intn 
                                     CONVERT_FLOATN(AS_INTN((h >> 10) & 1023u)) * unit);
     const intn blue = mean_channel((old >> 6) & 255, 255.0f, fmin(GATHER_FLOATN(picture.radiance, 4 * pixel + 2), 1.0f), is_bound, rate,
                                    CONVERT_FLOATN(AS_INTN((h >> 20) & 1023u)) * unit);
-    const intn next = (red << 23) | (green << 14) | (blue << 6) | next_count;
-    return MASK(mark > -1.0f) ? next : old;
+    const intn next = (red << 23) | (green << 14) | (blue << 6) | (next_weight + 1);
+    return MASK(mark > -1.0f) ? next : before;
 }
 
 // One work-group a brick; its items share the rows of LANES voxels along x.
-// allocated [count] brick indices, slots [z][y][x], picture -> voxels and colors, updated in place; solid and octets
-// (volume.clh) of the bricks in the view frustum.
+// allocated [count] brick indices, slots [z][y][x], picture -> voxels and colors, updated in place, or colors alone unless
+// `with_shape`; solid and octets (volume.clh) of the bricks in the view frustum.
 kernel void integrate(const int count, const int width, const int height, const int4 bricks, global const int *allocated,
                       global const int *slots, global const float *depth_m, global const float *radiance,
                       const float4 intrinsics, const float16 camera_from_volume, const float voxel_m,
-                      const float truncation_m, const float greatest_weight, const int frame, global float2 *voxels,
-                      global uint *colors, global ulong *solid, global uchar *octets) {
+                      const float truncation_m, const float greatest_weight, const int frame, const int with_shape,
+                      global float2 *voxels, global uint *colors, global ulong *solid, global uchar *octets) {
     local int rows[BRICK * BRICK];  // bit x: that voxel is solid
     local uint halves[2];           // of the brick's solid cells
     const int group = group_number();
@@ -114,11 +116,13 @@ kernel void integrate(const int count, const int width, const int height, const 
         floatn tsdf, weight;
         load_pairs(voxels + pool + first, &tsdf, &weight);
         if (ANY(known)) {
-            const floatn observed = fmin(distance / truncation_m, 1.0f);
-            const floatn more = weight + 1.0f;
-            tsdf = known ? tsdf + (observed - tsdf) / more : tsdf;
-            weight = known ? fmin(more, greatest_weight) : weight;
-            store_pairs(tsdf, weight, voxels + pool + first);
+            if (with_shape) {
+                const floatn observed = fmin(distance / truncation_m, 1.0f);
+                const floatn more = weight + 1.0f;
+                tsdf = known ? tsdf + (observed - tsdf) / more : tsdf;
+                weight = known ? fmin(more, greatest_weight) : weight;
+                store_pairs(tsdf, weight, voxels + pool + first);
+            }
             const intn colored = known & MASK(fabs(distance) < COLOR_REACH * voxel_m);
             if (ANY(colored)) {
                 global int *packed = (global int *)colors + pool + first;

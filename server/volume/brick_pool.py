@@ -85,6 +85,12 @@ class BrickPool:
                 "copy_bricks", len(slots[batch]), rows, staged_voxels, staged_colors, chosen, self.voxels, self.colors
             )
 
+    def forget_colors(self, share: float) -> None:
+        """Take `share` of their weight from all means of colour."""
+        slots = self.capacity + 1
+        kernel = self._engine.kernel("brick_pool.cl", "forget_colors")
+        self._engine.launch(kernel, (BRICK_CELLS * slots,), slots, np.float32(1 - share), self.colors)
+
     def _grown(self, buffer: DeviceBuffer, old: cl_array.Array) -> cl_array.Array:
         new = buffer.array((self.capacity + 1, *old.shape[1:]))
         self._engine.copy_into(new, 0, old)

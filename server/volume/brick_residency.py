@@ -94,6 +94,12 @@ class Residency:
         self._note_change(resident[self._in_view(camera, volume_from_camera, resident)])
         self._changed[self._requested] = self.changes
 
+    def forget_colors(self, share: float) -> None:
+        """Take `share` of their weight from the colours of all bricks."""
+        self.pool.forget_colors(share)
+        self.store.forget_colors(share)
+        self._note_change(self.existing())
+
     def existing(self) -> Indices:
         """All bricks with voxels, including released ones, sorted."""
         return np.sort(np.concatenate([self._table.resident(), self.store.indices()]))

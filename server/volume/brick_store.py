@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from server.volume.bricks import less_weight
+
 _BATCH = 1024
 
 
@@ -58,6 +60,11 @@ class BrickStore:
         for index in indices.tolist():
             del self._bricks[index]
         self._indices = None
+
+    def forget_colors(self, share: float) -> None:
+        """Take `share` of their weight from all means of colour."""
+        for index, (voxels, colors) in self._bricks.items():
+            self._bricks[index] = voxels, less_weight(colors, share)
 
     def take(self, indices: NDArray[np.int32]) -> tuple[NDArray[Any], NDArray[np.uint32]]:
         """Remove bricks. Returns their voxels and colours [n, 512]."""

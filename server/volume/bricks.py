@@ -25,7 +25,7 @@ class Bricks:
     colors: NDArray[np.float32]
     """[n, 8, 8, 8, 3] linear RGB in [0, 1]; 0 where there is none."""
     color_weight: NDArray[np.uint8]
-    """[n, 8, 8, 8] 0 = no colour."""
+    """[n, 8, 8, 8] 1 + the weight of the mean, in pictures; 0 = no colour. 1: only seen under another light."""
 
     @classmethod
     def joined(cls, parts: Sequence[Bricks]) -> Bricks:
@@ -43,12 +43,19 @@ def unpack_bricks(indices: NDArray[np.int32], voxels: NDArray[Any], packed: NDAr
 
 
 def unpack_colors(packed: NDArray[np.uint32]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Linear RGB [..., 3] and colour weight [...] of packed voxel colours.
+    """Linear RGB [..., 3] and color_weight [...] of packed voxel colours.
 
-    Bits 31..23 r, 22..14 g, 13..6 b hold sqrt(c) times their greatest value; bits 5..0 the weight, 0 = no colour.
+    Bits 31..23 r, 22..14 g, 13..6 b hold sqrt(c) times their greatest value; bits 5..0 color_weight of Bricks.
     """
     codes = np.stack([packed >> 23, (packed >> 14) & 511, (packed >> 6) & 255], axis=-1).astype(np.float32)
     return np.square(codes / np.array([511, 511, 255], np.float32)), (packed & 63).astype(np.uint8)
+
+
+def less_weight(packed: NDArray[np.uint32], share: float) -> NDArray[np.uint32]:
+    """Packed voxel colours [...] whose means have lost `share` of their weight, rounded. Twin of brick_pool.cl."""
+    stored = packed & 63
+    left = (np.maximum(stored, 1) - 1).astype(np.float32) * np.float32(1 - share) + np.float32(0.5)
+    return np.asarray(packed - stored + np.where(stored > 0, left.astype(np.uint32) + 1, 0), np.uint32)
 
 
 def _no_voxels() -> tuple[NDArray[np.float32], NDArray[np.uint32]]:

@@ -21,8 +21,13 @@ def integrate(
     camera: CameraModel,
     volume_from_camera: NDArray[np.float64],
     measurement: Measurement,
+    *,
+    with_shape: bool = True,
 ) -> None:
-    """Fuse a rectified depth image and its colours into the allocated bricks."""
+    """Fuse a rectified depth image and its colours into the allocated bricks.
+
+    with_shape: else its colours alone, of the picture that was fused last.
+    """
     if not volume.allocated_bricks:
         return
     items = 64 if engine.lanes == 1 else 1  # on a CPU, one work-item does a whole brick
@@ -43,12 +48,16 @@ def integrate(
         volume.truncation_m,
         GREATEST_WEIGHT,
         volume.frames,
+        with_shape,
         volume.voxels,
         volume.colors,
         volume.solid,
         volume.octets,
         local=(items,),
     )
+    if not with_shape:
+        volume.written = engine.mark()
+        return
     volume.count_frame()
     volume.note_picture(camera, volume_from_camera)
     volume.update_tables()

@@ -130,6 +130,11 @@ class Volume:
         """Mark bricks as changed by the integration of a frame from this pose."""
         self._residency.note_picture(camera, volume_from_camera)
 
+    def forget_colors(self, share: float) -> None:
+        """Take `share` of their weight from all colours, since the light has changed: the next pictures count more."""
+        self._residency.forget_colors(share)
+        self.written = self._engine.mark()
+
     @property
     def changes(self) -> int:
         """Increases whenever voxels change."""

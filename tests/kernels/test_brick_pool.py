@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from server.opencl.engine import Engine, KernelArgument
 from server.volume.brick_pool import BRICK_VOXELS, BrickPool
 from server.volume.brick_table import AWAY_SLOT, NO_SLOT
+from server.volume.bricks import less_weight
 from tests.reference import brick_pool as twin
 from tests.scenes.volumes import vectors
 
@@ -48,6 +49,22 @@ def test_kernels_match_their_twins(engine: Engine, count: int) -> None:
         vectors(engine.download(target[0])), twin.copy_bricks(voxels, slots, other_voxels, places)
     )
     np.testing.assert_array_equal(engine.download(target[1]), twin.copy_bricks(colors, slots, other_colors, places))
+
+
+@pytest.mark.parametrize("share", [0.0, 1 / 3, 1.0])
+def test_forgetting_colors_matches_its_twin(engine: Engine, share: float) -> None:
+    """On the device and on the host; at 1 colours stay, of no weight."""
+    pool = BrickPool(engine)
+    pool.grow(SLOTS)
+    _, colors = random_pool(np.random.default_rng(4), SLOTS + 1)
+    colors[:, ::5] = 0
+    pool.colors.set(colors)
+    pool.forget_colors(share)
+    wanted = twin.forget_colors(colors, share)
+    np.testing.assert_array_equal(engine.download(pool.colors), wanted)
+    np.testing.assert_array_equal(less_weight(colors, share), wanted)
+    assert (wanted >> 6 == colors >> 6).all()
+    assert share < 1 or set(np.unique(wanted & 63)) == {0, 1}
 
 
 @pytest.mark.parametrize("clears", [False, True])

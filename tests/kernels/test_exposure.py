@@ -69,7 +69,8 @@ def volume(engine: Engine) -> Volume:
 
 def dense(engine: Engine, volume: Volume) -> twin.DenseVolume:
     tsdf, weight, _ = dense_voxels(engine, volume)
-    color, observations = dense_colors(volume)
+    color, stored = dense_colors(volume)
+    observations = np.maximum(stored - 1, 0)
     return twin.DenseVolume(VOXEL_M, tsdf.astype(np.float64), weight.astype(np.float64), color, observations)
 
 
@@ -120,6 +121,14 @@ def test_what_was_not_there_is_not_compared(engine: Engine, volume: Volume) -> N
     assert found is not None
     assert abs(found.value) < 0.001  # seen: 0.0001
     assert samples.seen.max() < 0.7
+
+
+def test_colors_of_another_light_are_not_compared(engine: Engine, volume: Volume) -> None:
+    pose = volume.volume_from_world() @ VIEWS[2]
+    measurement, *_ = picture(engine, VIEWS[2], 1.0)
+    assert len(compare_exposure(engine, CAMERA, measurement, volume, pose)) > 100
+    volume.forget_colors(1.0)
+    assert len(compare_exposure(engine, CAMERA, measurement, volume, pose)) == 0
 
 
 def test_nothing_is_said_of_places_that_were_never_seen(engine: Engine, volume: Volume) -> None:

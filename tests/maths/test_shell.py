@@ -9,7 +9,7 @@ from server.light.shell import weights
 from server.light.shell.distant import distant_light
 from server.light.shell.evidence import DARKEST, log_chroma, materials_of
 from server.light.shell.objective import Unknowns, step
-from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights
+from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights, ray_directions
 from server.light.shell.shell import (
     BEHIND_M,
     CELLS,
@@ -26,7 +26,7 @@ from server.light.shell.solver import LEAST_PATCHES
 from server.light.shell.sources import distant_sources
 from server.light.shell.switches import Switches
 from server.light.shell.transport import SATURATED, Transport, meet
-from server.maths.lobes import LOBES, lobes_to_sh
+from server.maths.lobes import LOBES, lobes_along, lobes_to_sh
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from tests.reference.room_objective import level_objective, middle_objective
 from tests.scenes.analytic import Floats
@@ -300,30 +300,37 @@ def test_the_box_holds_scan_cameras_and_a_ceiling() -> None:
 
 def test_what_rays_meet() -> None:
     transport, shell = Transport(), Shell(np.eye(3), np.zeros(3), np.full(3, 4.0), 0.0, np.zeros((2, 3)))
-    directions = np.array([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0, 0, -1.0]]])
-    arrivals = np.array([[[0.2, 0.3, 0.4, 1e-3], [0, 0, 0, -1e-3], [1, SATURATED, 0.95, 1e-3], [0, 0, 0, 0]]])
+    directions = np.array([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0, 0, -1.0], [-1.0, 0, 0]]])
+    of_surface = [[0.2, 0.3, 0.4, 1e-3], [0, 0, 0, -1e-3], [1, SATURATED, 0.95, 1e-3]]
+    arrivals = np.array([[*of_surface, [0, 0, 0, 0], [0.4, 0.5, 0.6, -1e-3]]])  # the last only another light showed
     patches, middle = Patches(), np.array([[2.0, 2.0, 2.0]])
     patches.positions[:1], patches.weights[0], patches.traced_in[0] = middle, 1.0, 1
-    patches.traced_normals[0], patches.arrivals[0] = [0.6, 0.0, 0.8], np.tile(arrivals[0], (RAYS // 4, 1))
+    patches.traced_normals[0], patches.arrivals[0] = [0.6, 0.0, 0.8], np.tile(arrivals[0], (RAYS // 5 + 1, 1))[:RAYS]
     transport.update(patches, NO_EMITTERS, np.array([0]), shell)
     met = meet(shell, transport.hidden, middle, directions, arrivals)
-    (known, back, bright, free), shares = met.columns[0], met.shares[0]
+    (known, back, bright, free, outdated), shares = met.columns[0], met.shares[0]
     assert (known == -1).all()
-    np.testing.assert_allclose(shares.sum(axis=-1), [0, 1, 1, 1])
+    np.testing.assert_allclose(shares.sum(axis=-1), [0, 1, 1, 1, 1])
     back, bright = back[0], bright[0]
     np.testing.assert_array_equal(met.known[0, 0], [0.2, 0.3, 0.4])
     np.testing.assert_array_equal(met.known[0, 2], [1, SATURATED, 0.95])
-    np.testing.assert_array_equal(met.is_saturated[0], [False, False, True, False])
+    np.testing.assert_array_equal(met.is_saturated[0], [False, False, True, False, False])
     assert not transport.is_saturated[back]
     assert back >= CELLS
     assert transport.is_saturated[bright]
     np.testing.assert_allclose(transport.clipped[bright], [1, SATURATED, 0.95])
     cells, _ = shell.exits(np.array([2.0, 2.0, 2.0]), np.array([0.0, 0, -1.0]))
     np.testing.assert_array_equal(free, cells)
+    np.testing.assert_array_equal(outdated, shell.exits(np.array([2.0, 2.0, 2.0]), np.array([-1.0, 0, 0]))[0])
+    np.testing.assert_array_equal(met.known[0, 4], 0.0)
     assert transport.columns == CELLS + 2
-    of_each = hemisphere_weights(patches.traced_normals[:1])[0].reshape(-1, 4).sum(axis=0)
+    towards = hemisphere_weights(patches.traced_normals[:1])[0]
+    of_each = np.bincount(np.arange(RAYS) % 5, towards)
     shares = transport.shares[0]
-    np.testing.assert_allclose([shares[back], shares[bright], shares[:CELLS].sum()], of_each[1:], rtol=1e-5)
+    wanted = [of_each[1], of_each[2], of_each[3] + of_each[4]]
+    np.testing.assert_allclose([shares[back], shares[bright], shares[:CELLS].sum()], wanted, rtol=1e-5)
+    lobes = towards[3::5] @ lobes_along(ray_directions()[3::5])
+    np.testing.assert_allclose(transport.beyond[0].sum(axis=0), lobes, rtol=1e-4)  # surface lets nothing through
     np.testing.assert_allclose(transport.known[0], of_each[[0, 2]] @ arrivals[0, [0, 2], :3], rtol=1e-5)
 
 

@@ -63,9 +63,12 @@ def test_a_tight_budget_ends_with_the_same_bits(engine: Engine, device: Device) 
     views = walk(60)
     ample, tight = room_volume(engine, 10**5), room_volume(Engine(device), TIGHT)
     released = 0
-    for view in views:
+    for number, view in enumerate(views):
         fuse_walk(engine, ample, [view])
         fuse_walk(tight._engine, tight, [view])
+        if number == 30:  # the light has changed in part
+            ample.forget_colors(0.6)
+            tight.forget_colors(0.6)
         assert not ample.is_full
         assert not tight.is_full
         assert tight.voxels.nbytes + tight.colors.nbytes + tight.octets.nbytes <= (TIGHT + 1) * BRICK_BYTES
@@ -79,6 +82,17 @@ def test_a_tight_budget_ends_with_the_same_bits(engine: Engine, device: Device) 
         np.testing.assert_array_equal(found[0], wanted[0])
         assert np.abs(found[1] - wanted[1]).max() < 0.02 * VOXEL_M  # rays start elsewhere where less is resident
     tight._engine.close()
+
+
+def test_colors_that_lose_weight_are_saved_again(engine: Engine) -> None:
+    volume = room_volume(engine, TIGHT)
+    fuse_walk(engine, volume, walk(12)[:4])
+    assert volume.released_bricks > 0
+    saved = volume.changes
+    assert not len(volume.changed_since(saved))
+    volume.forget_colors(1.0)
+    np.testing.assert_array_equal(volume.changed_since(saved), volume.places())
+    assert set(np.unique(volume.download_bricks().color_weight)) == {0, 1}
 
 
 def test_colours_come_back_too(engine: Engine) -> None:

@@ -20,13 +20,14 @@ def trace_arrivals(
     weight: Floats,
     colors: Floats,
     has_color: Bools,
+    is_outdated: Bools,
     voxel_m: float,
     truncation_m: float,
 ) -> tuple[Floats, Floats]:
     """Arrivals [n, m, 4] as of the kernel, and how clearly each surface faces [n, m]: the cosine to its outward normal.
 
     points [n, 3], normals [n, 3] of the surface that they lie on, or None, directions [n, m, 3]; tsdf, weight,
-    has_color [z, y, x], colors [z, y, x, 3].
+    has_color and is_outdated (its colour is of another light) [z, y, x], colors [z, y, x, 3].
     """
     shape = directions.shape[:2]
     if normals is not None:
@@ -39,15 +40,15 @@ def trace_arrivals(
         met &= np.einsum("nmk,nk->nm", directions, normals).ravel() > 0
     at = (origins + np.where(met, distance, 0.0)[:, None] * along) / voxel_m
     # The kernel's walk begins and goes on by 0.01 voxel, so it reads a voxel that it has entered.
-    color, known = _color(colors, has_color, at + 0.01 * along)
-    before, known_before = _color(colors, has_color, at - 0.99 * along)
-    color, known = np.where(known[:, None], color, before), known | known_before
+    first, second = (_voxels(has_color.shape, at + step * along) for step in (0.01, -0.99))
+    z, y, x = np.where(has_color[first], first, second)
+    color, known, outdated = colors[z, y, x], has_color[z, y, x], is_outdated[z, y, x]
     slope, is_seen = _slope(tsdf, weight, at + 0.01 * along)
     facing = np.where(is_seen, (slope * along).sum(-1) / np.maximum(np.linalg.norm(slope, axis=-1), 1e-12), -1.0)
     result = np.zeros((len(origins), 4))
-    is_known = met & known & (facing <= 0)
-    result[is_known, :3] = color[is_known]
-    result[:, 3] = np.where(met, np.where(is_known, 1.0, -1.0) * np.maximum(distance, 0.01 * voxel_m), 0.0)
+    is_front = met & known & (facing <= 0)
+    result[is_front, :3] = color[is_front]
+    result[:, 3] = np.where(met, np.where(is_front & ~outdated, 1.0, -1.0) * np.maximum(distance, 0.01 * voxel_m), 0.0)
     return result.reshape(*shape, 4), facing.reshape(shape)
 
 
@@ -64,9 +65,10 @@ def _clear_of_surface(
     return np.asarray(origins + (missing / np.maximum(steepness, 1e-12))[:, None] * slope)
 
 
-def _color(colors: Floats, has_color: Bools, at: Floats) -> tuple[Floats, Bools]:
-    x, y, z = np.clip(at.astype(int), 0, np.array(has_color.shape[::-1]) - 1).T
-    return colors[z, y, x], has_color[z, y, x]
+def _voxels(shape: tuple[int, ...], at: Floats) -> tuple[NDArray[np.int64], ...]:
+    """Indices z, y, x of the voxels that points [n, 3] (voxels) lie in."""
+    x, y, z = np.clip(at.astype(np.int64), 0, np.array(shape[::-1]) - 1).T
+    return z, y, x
 
 
 def _slope(tsdf: Floats, weight: Floats, at: Floats) -> tuple[Floats, Bools]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 
@@ -22,6 +23,13 @@ def clear_slots(slots: NDArray[Any], voxels: NDArray[Any], colors: NDArray[Any])
     voxels, colors = voxels.copy(), colors.copy()
     voxels[slots], colors[slots] = 0, 0
     return voxels, colors
+
+
+def forget_colors(colors: NDArray[Any], share: float) -> NDArray[Any]:
+    """Packed colours after their means have lost `share` of their weight, which is 1 less than the lowest six bits."""
+    stored = (colors & 63).astype(np.int64)
+    left = 1 + np.floor((1 - share) * (stored - 1) + 0.5).astype(np.int64)
+    return np.asarray((colors.astype(np.int64) - stored + np.where(stored > 0, left, 0)).astype(np.uint32))
 
 
 def copy_bricks(source: NDArray[Any], chosen: NDArray[Any], target: NDArray[Any], places: NDArray[Any]) -> NDArray[Any]:

@@ -88,7 +88,7 @@ def integrate_color(
     color: Floats,
     count: Floats,
 ) -> tuple[Floats, Floats]:
-    """Linear RGB [z, y, x, 3] and its weight [z, y, x] after one more picture: a running mean, the weight at most 63.
+    """Linear RGB [z, y, x, 3] and its weight [z, y, x] after one more picture: a running mean, the weight at most 62.
 
     A voxel within 1.5 voxels of the measured surface takes the colour of its nearest pixel. radiance: [h, w, 3].
     """
@@ -96,6 +96,6 @@ def integrate_color(
     near = np.abs(signed_distance(camera, points, depth_m, truncation_m)) < 1.5 * voxel_m  # NaN is not near
     pixels = np.where(near[..., None], project(camera, points), 0)
     u, v = np.floor(pixels + 0.5).astype(int).transpose(-1, 0, 1, 2)
-    next_count = np.minimum(count + 1, 63)
+    next_count = np.minimum(count + 1, 62)
     mean = color + (np.minimum(radiance[v, u], 1) - color) / next_count[..., None]
     return np.where(near[..., None], mean, color), np.where(near, next_count, count)

@@ -22,10 +22,13 @@ WALL, FLOOR = (0.6, 0.3, 0.1), (0.05, 0.1, 0.4)
 MOST = np.array([511, 511, 255])
 
 
-def paint(engine: Engine, volume: Volume, colors: Floats, has_color: Bools | bool = True) -> None:
-    """Give every voxel [z, y, x] its linear RGB [..., 3] or none, packed as bricks.py has it."""
+def paint(
+    engine: Engine, volume: Volume, colors: Floats, has_color: Bools | bool = True, is_outdated: Bools | bool = False
+) -> None:
+    """Give every voxel [z, y, x] its linear RGB [..., 3] or none, packed as bricks.py has it; some of another light."""
     r, g, b = np.moveaxis(np.rint(np.sqrt(colors) * MOST).astype(np.uint32), -1, 0)
-    packed = np.where(has_color, r << 23 | g << 14 | b << 6 | 5, 0).astype(np.uint32)
+    weight = np.where(is_outdated, 1, 5)
+    packed = np.where(has_color, r << 23 | g << 14 | b << 6 | weight, 0).astype(np.uint32)
     pool = engine.download(volume.colors)
     pool[engine.download(volume.slots_device).ravel()] = in_bricks(packed)
     volume.colors.set(pool, engine.queue)

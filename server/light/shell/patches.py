@@ -48,7 +48,7 @@ them, what a window sends to a patch is a tenth off, and the light turns by as m
 TRACED_A_FRAME = 16
 """Patches whose rays are traced again in each frame, once all have been traced: the scan around them keeps growing."""
 OUTDATED_LEFT = 0.5
-"""Share of what is outdated that still is a frame later: colours of the scan follow another light within a few."""
+"""Share of what is outdated that still is a frame later: more of the scan is seen under the new light by then."""
 MOST_WEIGHT = 30.0
 """Number of frames over which a patch is averaged."""
 _FORGOTTEN = 1e-3  # frames: a patch of less weight is none

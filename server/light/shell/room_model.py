@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from server.frame_context import FrameContext
+from server.input.measure import Measurement
 from server.light.arrivals import PendingArrivals, begin_arrivals
 from server.light.light_estimation import LightEstimate
 from server.light.shell.beside import Beside
@@ -35,6 +36,7 @@ from server.light.shell.solver import LEAST_PATCHES, STILL
 from server.light.shell.solver_process import Asked, SolverProcess, Task
 from server.light.shell.switches import Switches
 from server.opencl.pacing import Pacer
+from server.volume.integrate import integrate
 from server.volume.volume import Volume
 
 STEADY, CHANGED = 0.25, 0.35
@@ -128,6 +130,8 @@ class RoomModel:
         if self._patches.is_empty:
             self._patches = Patches(patch_side_m(seen.positions, volume.voxel_m))
         change = self._change(seen) if switches.memory else 1.0
+        if switches.memory and change > 0.0:
+            _forget_colors(context, change)
         self._patches.forget(change)
         self._bright.forget(change)
         self._patches.add(seen)
@@ -237,3 +241,11 @@ class RoomModel:
         medians = ndimage.median(changes, facing, many)
         change = np.sqrt(np.average(medians**2, weights=np.sqrt(counts[many])))
         return float(np.clip((change - STEADY) / (CHANGED - STEADY), 0.0, 1.0))
+
+
+def _forget_colors(context: FrameContext, share: float) -> None:
+    """The scan's colours lose `share` of their weight; the frame, which the rest hides in its means, counts again."""
+    context.volume.forget_colors(share)
+    shown = Measurement(context.scene_radiance, context.measurement.depth_m)
+    camera, pose = context.camera, context.volume_from_camera
+    integrate(context.engine, context.volume, camera, pose, shown, with_shape=False)

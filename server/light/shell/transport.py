@@ -1,7 +1,8 @@
 """How radiance travels in a room: from which unknown cells a patch receives light, and what it is known to receive.
 
 Unknown cells are those of the shell, what saturated surface sends beyond what the picture could show, and surface that
-was met from its back or without a colour. Scanned surface sends what the camera saw it send.
+was met from its back or without a colour. Scanned surface sends what the camera saw it send; where it was seen under
+another light only, the shell behind it does.
 """
 
 from __future__ import annotations
@@ -107,16 +108,19 @@ class Transport:
         weights, positions = hemisphere_weights(patches.traced_normals[rows]), patches.positions[rows]
         met = patches.arrivals[rows].reshape(-1, 4)
         above = np.flatnonzero(weights)
-        is_free = np.take(met[:, 3], above) == 0
+        distances = np.take(met[:, 3], above)
+        is_free, behind = distances == 0, np.flatnonzero(distances < 0)
+        is_free[behind] = _of_another_light(np.take(met, above[behind], axis=0))
         row, ray, share = _of_rays(weights, above[is_free])
         columns, corners = shell.exits(np.take(positions, row, axis=0), np.take(ray_directions(), ray, axis=0))
         sums = _summed(row, columns, corners * share[:, None], len(rows))
-        self.beyond[rows] = _beyond(row, ray, share, columns[:, 0], len(rows))
+        nothing_met = distances[is_free] == 0
+        self.beyond[rows] = _beyond(row, ray, share * nothing_met, columns[:, 0], len(rows))
         row, ray, share = _of_rays(weights, above[~is_free])
         arrivals = np.take(met, above[~is_free], axis=0).astype(np.float64)
         ends = np.take(positions, row, axis=0) + np.abs(arrivals[:, 3:]) * np.take(ray_directions(), ray, axis=0)
         back, bright = arrivals[:, 3] < 0, _is_bright(arrivals)
-        keys = 2 * _cell_numbers(ends[back], HIDDEN_M)
+        keys = _back_keys(ends[back])
         self._add_cells(keys, is_saturated=False)
         np.add.at(sums.reshape(-1), COLUMNS * row[back] + columns_of(self.hidden, keys), share[back])
         self._by_rays[rows] = sums
@@ -196,6 +200,11 @@ def floor_shares(shell: Shell) -> NDArray[np.float32]:
     return sums[:, :CELLS].astype(np.float32)
 
 
+def _back_keys(points: Floats) -> Ints:
+    """[n] keys of the cells of hidden surface at points [n, 3]."""
+    return np.asarray(2 * _cell_numbers(points, HIDDEN_M))
+
+
 def bright_keys(points: Floats) -> Ints:
     """[n] keys of the cells of saturated surface at points [n, 3]."""
     return np.asarray(2 * _cell_numbers(points, CELL_M) + 1)
@@ -207,33 +216,36 @@ def meet(shell: Shell, hidden: Mapping[int, int], origins: Floats, directions: F
     hidden: as of Transport.
     """
     distance, radiance = arrivals[..., 3], arrivals[..., :3]
-    is_bright, is_free = _is_bright(arrivals), distance == 0
+    is_bright, is_back = _is_bright(arrivals), _is_back(arrivals)
+    is_free = (distance <= 0) & ~is_back
     columns = np.full((*distance.shape, CORNERS), KNOWN, np.int64)
     shares = np.zeros((*distance.shape, CORNERS))
     starts = np.broadcast_to(origins[:, None], directions.shape)
     columns[is_free], shares[is_free] = shell.exits(starts[is_free], directions[is_free])
-    back, bright = _hidden_keys(origins, directions, arrivals)
-    for chosen, keys in ((distance < 0, back), (is_bright, bright)):
-        columns[chosen] = columns_of(hidden, keys)[:, None]
+    for chosen, keys_of in ((is_back, _back_keys), (is_bright, bright_keys)):
+        ends = starts[chosen] + np.abs(distance[chosen])[:, None] * directions[chosen]
+        columns[chosen] = columns_of(hidden, keys_of(ends))[:, None]
         shares[chosen, 0] = 1.0
     known = np.where((distance > 0)[..., None], radiance, 0.0)
     return Met(columns, shares, known, is_bright, np.abs(distance))
+
+
+def _is_back(arrivals: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """[...] whether surface was met from its back, or has no colour."""
+    result = np.asarray(arrivals[..., 3] < 0)
+    result[result] = ~_of_another_light(arrivals[result])
+    return result
+
+
+def _of_another_light(behind: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """[n] of arrivals [n, 4] at negative distances: whether the surface has a colour, from another light."""
+    return np.asarray(behind[:, :3].max(axis=1) > 0)
 
 
 def _is_bright(arrivals: NDArray[np.floating]) -> NDArray[np.bool_]:
     red, green, blue = np.moveaxis(arrivals[..., :3], -1, 0)  # three times as fast as a maximum along the last axis
     most, least = np.maximum(np.maximum(red, green), blue), np.minimum(np.minimum(red, green), blue)
     return np.asarray((arrivals[..., 3] > 0) & (most >= SATURATED) & (least >= ALL_CHANNELS * most))
-
-
-def _hidden_keys(origins: Floats, directions: Floats, arrivals: Floats) -> tuple[Ints, Ints]:
-    """Keys of the cells of hidden surface and of saturated surface, one of each ray that meets such."""
-    row, ray = np.nonzero(arrivals[..., 3] < 0)
-    bright_row, bright_ray = np.nonzero(_is_bright(arrivals))
-    distance = np.abs(arrivals[..., 3, None])
-    back = origins[row] + distance[row, ray] * directions[row, ray]
-    bright = origins[bright_row] + distance[bright_row, bright_ray] * directions[bright_row, bright_ray]
-    return 2 * _cell_numbers(back, HIDDEN_M), bright_keys(bright)
 
 
 def _cell_numbers(points: Floats, side_m: float) -> Ints:

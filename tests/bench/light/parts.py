@@ -8,6 +8,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+from tests.bench.light.changes import changes_part
 from tests.bench.light.closed_rooms import closed_rooms_part
 from tests.bench.light.e1 import SEQUENCES, sequence_part
 from tests.bench.light.honesty import honesty_part
@@ -48,6 +49,7 @@ PARTS: dict[str, Callable[[Run], Part]] = {
     **{sequence.name: partial(sequence_part, sequence=sequence) for sequence in SEQUENCES},
     "closed rooms": closed_rooms_part,
     "lamps in view": lamps_in_view_part,
+    "light that changes": changes_part,
     "half black room": halves_part,
     "robustness": robustness_part,
     "honesty": honesty_part,

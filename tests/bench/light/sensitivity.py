@@ -56,7 +56,7 @@ CONSTANTS = (
     Constant("weights", "FLOOR_PATCHES", 5, 20),
     Constant("weights", "CELL_HIDDEN", 0.35, 1.4),
     Constant("weights", "SMOOTHNESS", 0.65, 2.6),
-    Constant("weights", "EDGE", 0.25, 1.0),
+    Constant("weights", "EDGE", 0.125, 0.5),
     Constant("weights", "CHROMA_NOISE", 0.03, 0.12),
     Constant("weights", "CELL_CHROMA", 0.15, 0.6),
     Constant("weights", "TINT", 0.225, 0.9),

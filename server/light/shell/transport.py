@@ -22,17 +22,20 @@ from server.maths.lobes import LOBES, lobes_along
 
 HIDDEN_M = 0.6
 """Side of the cells of hidden surface: a piece of furniture. Those of saturated surface are smaller (CELL_M)."""
-MOST_HIDDEN = 128
-"""Most cells of both kinds together; surface beyond that shares the last one."""
+MOST_HIDDEN, MOST_SATURATED = 128, 96
+"""Most cells of each kind. Surface beyond that shares one more cell of its kind: what is hidden must not send as a lamp
+does. A furnished room has 110 and 60 in a second, the real kitchen 60 and 65 in seven."""
 SATURATED, ALL_CHANNELS = 0.97, 0.9
 """Radiance of the strongest channel from which a picture's values are lower bounds, code 252 of 255, and the share of
 it that the weakest has then: where another channel is not clipped, the surface is hardly brighter than it looks."""
-COLUMNS = CELLS + MOST_HIDDEN
+COLUMNS = CELLS + MOST_HIDDEN + 1 + MOST_SATURATED + 1
 KNOWN, NO_CELL = -1, -2
 """Values in place of a cell: KNOWN is photographed surface; NO_CELL is hidden or saturated surface from which no patch
 has received light."""
 NEAR_SIDES = 2 / 3
 """Surface within so many sides of a patch is near it: of PATCH_M, .1 m."""
+SHARED = -2, -1
+"""Keys of the cells that hidden and saturated surface share, each even or odd as all keys of its kind."""
 _MIDDLE = 1 << 19  # half the cells along an axis: 150 km
 _AT_ONCE = 64  # patches whose rays are worked on together: 32 768 rays, some MB
 _MOST_COUNTED = 1e4  # rays that the mean of a saturated cell remembers
@@ -161,10 +164,13 @@ class Transport:
         self.shares[rows] = sums
 
     def _add_cells(self, keys: Ints, *, is_saturated: bool) -> None:
-        for key in np.unique(keys):
-            if int(key) not in self.hidden and len(self.hidden) < MOST_HIDDEN:
+        most = MOST_SATURATED if is_saturated else MOST_HIDDEN
+        for key in map(int, np.unique(keys)):
+            is_full = np.count_nonzero(self.is_saturated[CELLS : self.columns] == is_saturated) >= most
+            number = SHARED[is_saturated] if is_full and key not in self.hidden else key
+            if number not in self.hidden:
                 self.is_saturated[self.columns] = is_saturated
-                self.hidden[int(key)] = self.columns
+                self.hidden[number] = self.columns
 
     def _note_clipped(self, columns: Ints, radiance: Floats) -> None:
         """Fold in the clipped `radiance` [n, 3] of saturated cells `columns` [n]."""
@@ -254,10 +260,10 @@ def _cell_numbers(points: Floats, side_m: float) -> Ints:
 
 
 def columns_of(hidden: Mapping[int, int], keys: Ints) -> Ints:
-    """[n] columns by the `keys` [n] of cells; where there is no such cell NO_CELL, or the last one if no more fit."""
+    """[n] columns by the `keys` [n] of cells; where there is no such cell the one that others share, or NO_CELL."""
     found, inverse = np.unique(keys, return_inverse=True)
-    other = COLUMNS - 1 if len(hidden) >= MOST_HIDDEN else NO_CELL
-    columns = np.array([hidden.get(int(key), other) for key in found], np.int64)
+    shared = [hidden.get(key, NO_CELL) for key in SHARED]
+    columns = np.array([hidden.get(int(key), shared[key % 2]) for key in found], np.int64)
     return np.asarray(columns[inverse.ravel()])
 
 

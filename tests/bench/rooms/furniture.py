@@ -283,6 +283,13 @@ def _lamp_behind_and_window(build: _Builder) -> None:
     build.window("beside", -0.6, 0.5, 6 * COOL)
 
 
+def _floor_lamp_and_window_ahead(build: _Builder) -> None:
+    x, z = build.room.side * (build.x - 0.6), build.z - 0.9
+    build.box([x - 0.015, -1.2, z - 0.015], [x + 0.015, 0.0, z + 0.015], build.color(0.1, 0.3))
+    build.ball([x, -1.2, z], 0.14, PANE, 40 * WARM)
+    build.window("ahead", -0.3 * build.room.side, 0.4, 6 * COOL)
+
+
 def _two_windows(build: _Builder) -> None:
     build.window("beside", -0.2, 0.5, 7 * COOL)
     build.window("behind", 0.5, 0.5, 7 * COOL)
@@ -298,5 +305,6 @@ LIGHTS: dict[str, Callable[[_Builder], None]] = {
     "lamp": lambda build: build.ball([-build.room.side * (build.x - 0.5), -1.55, 0.9], 0.12, PANE, 60 * WARM),
     "lamp-over-table": lambda build: build.ball([-0.35 * build.room.side + 0.1, -1.95, 0.45], 0.11, PANE, 60 * WARM),
     "lamp-and-window": _lamp_behind_and_window,
+    "lamp-and-window-ahead": _floor_lamp_and_window_ahead,
 }
 """What lights a room, by name."""

@@ -25,7 +25,7 @@ from server.light.shell.shell import (
 from server.light.shell.solver import LEAST_PATCHES
 from server.light.shell.sources import distant_sources
 from server.light.shell.switches import Switches
-from server.light.shell.transport import SATURATED, Transport, meet
+from server.light.shell.transport import COLUMNS, MOST_HIDDEN, MOST_SATURATED, SATURATED, Transport, meet
 from server.maths.lobes import LOBES, lobes_along, lobes_to_sh
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from tests.reference.room_objective import level_objective, middle_objective
@@ -332,6 +332,26 @@ def test_what_rays_meet() -> None:
     lobes = towards[3::5] @ lobes_along(ray_directions()[3::5])
     np.testing.assert_allclose(transport.beyond[0].sum(axis=0), lobes, rtol=1e-4)  # surface lets nothing through
     np.testing.assert_allclose(transport.known[0], of_each[[0, 2]] @ arrivals[0, [0, 2], :3], rtol=1e-5)
+
+
+def test_cells_beyond_the_most_share_one_of_their_kind() -> None:
+    transport, shell = Transport(), Shell(np.eye(3), np.full(3, -50.0), np.full(3, 50.0), 0.0, np.zeros((2, 3)))
+    patches, kinds = Patches(), np.arange(RAYS) % 2
+    patches.weights[0], patches.traced_in[0], patches.traced_normals[0] = 1.0, 1, [0.0, 0.0, 1.0]
+    away = np.linspace(5.0, 40.0, RAYS)
+    patches.arrivals[0] = np.stack([*np.tile(kinds, (3, 1)), np.where(kinds, away, -away)], axis=1)
+    transport.update(patches, NO_EMITTERS, np.array([0]), shell)
+    assert transport.columns == COLUMNS
+    arrivals = patches.arrivals[:1].astype(np.float64)
+    met = meet(shell, transport.hidden, np.zeros((1, 3)), ray_directions()[None], arrivals)
+    columns, above = met.columns[0, :, 0], ray_directions()[:, 2] > 0
+    np.testing.assert_array_equal(transport.is_saturated[columns[above]], kinds[above] == 1)
+    assert [len(np.unique(columns[above & (kinds == kind)])) for kind in (0, 1)] == [
+        MOST_HIDDEN + 1,
+        MOST_SATURATED + 1,
+    ]
+    shares = np.bincount(columns[above], hemisphere_weights(patches.traced_normals[:1])[0][above], COLUMNS)
+    np.testing.assert_allclose(transport.shares[0], shares, atol=1e-6)
 
 
 # ---- light from far away ---------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the furniture, the paints and the noise")
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--samples", type=int, default=16, help="rays of a pixel, before the pictures are denoised")
+    parser.add_argument("--turn", action="store_true", help="the camera turns once around, and sees the ceiling")
     asked = parser.parse_args(arguments)
     if asked.folder.exists():
         return _refuse(f"{asked.folder} exists: name a folder that does not")
@@ -36,7 +37,9 @@ def main(arguments: list[str] | None = None) -> int:
 
     room = furnished_room(asked.seed, asked.light)
     traced = TracedRoom(room)
-    write_room(asked.folder, room, traced, asked.seed, asked.frames, asked.samples, _say, denoise=denoised)
+    write_room(
+        asked.folder, room, traced, asked.seed, asked.frames, asked.samples, _say, denoise=denoised, turns=asked.turn
+    )
     print(f"wrote {asked.folder}")
     return 0
 

@@ -64,11 +64,21 @@ class Room:
         return [(what, np.array([self.side * x, y, z])) for what, x, y, z in (*near, middle, corner)]
 
 
-def camera_pose(room: Room, share: float) -> Floats:
-    """[4, 4] world_from_camera at a share of the way, from 0 to 1: from the table over to the other side."""
+def camera_pose(room: Room, share: float, *, turns: bool = False) -> Floats:
+    """[4, 4] world_from_camera at a share of the way, from 0 to 1: from the table over to the other side.
+
+    turns: then once around, and up to the ceiling now and then, in the middle of the room.
+    """
     eased = share * share * (3 - 2 * share)
     place = [(-0.15 + 0.55 * eased) * room.side, -1.4 + 0.04 * np.sin(7 * share), -1.0 + 0.45 * eased]
     yaw, pitch = room.side * np.radians(-17 + 57 * eased), np.radians(29 + 1.5 * np.sin(5 * share))
+    if turns:
+        place = [
+            (-0.15 + 0.25 * np.sin(np.pi * share)) * room.side,
+            -1.4 + 0.04 * np.sin(7 * share),
+            -1.0 + 0.4 * share,
+        ]
+        yaw, pitch = room.side * np.radians(-17 + 360 * share), np.radians(14 - 22 * np.sin(6 * np.pi * share))
     forward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)
@@ -284,7 +294,7 @@ def _lamp_behind_and_window(build: _Builder) -> None:
 
 
 def _floor_lamp_and_window_ahead(build: _Builder) -> None:
-    x, z = build.room.side * (build.x - 0.6), build.z - 0.9
+    x, z = build.room.side * (build.x - 0.45), build.z - 1.7
     build.box([x - 0.015, -1.2, z - 0.015], [x + 0.015, 0.0, z + 0.015], build.color(0.1, 0.3))
     build.ball([x, -1.2, z], 0.14, PANE, 40 * WARM)
     build.window("ahead", -0.3 * build.room.side, 0.4, 6 * COOL)

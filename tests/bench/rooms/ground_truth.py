@@ -43,11 +43,20 @@ class Traced(Protocol):
 
 
 def write_room(
-    folder: Path, room: Room, traced: Traced, seed: int, frames: int, samples: int, say: Say, *, denoise: Denoise
+    folder: Path,
+    room: Room,
+    traced: Traced,
+    seed: int,
+    frames: int,
+    samples: int,
+    say: Say,
+    *,
+    denoise: Denoise,
+    turns: bool = False,
 ) -> None:
     """Trace all pictures and places of `room`, and write them to `folder`."""
     random = np.random.default_rng(seed)
-    poses = [camera_pose(room, index / max(frames - 1, 1)) for index in range(frames)]
+    poses = [camera_pose(room, index / max(frames - 1, 1), turns=turns) for index in range(frames)]
     shape, middles = (HEIGHT, WIDTH), directions(None)
     pictures, depths = [], []
     for index, pose in enumerate(poses):

@@ -88,8 +88,11 @@ class Emitters:
         cosines = np.maximum(np.einsum("nkr,nr->nk", directions, normals), 0.0)
         return np.asarray(cosines * areas / (np.pi * distances**2 + areas))
 
-    def lit_by(self, patches: Patches) -> Floats:
-        """[k] from 0 to 1: how far the light on surface nearby that faces alike explains what each sends."""
+    def lit_by(self, patches: Patches, up: Floats) -> Floats:
+        """[k] from 0 to 1: how far the light on surface nearby that faces alike explains what each sends.
+
+        Flat surface that faces up is lit: a table, a floor. up: [3] unit, world.
+        """
         rows = patches.used[patches.clipped[patches.used] < 0.5]
         apart = ((self.centers[:, None] - patches.positions[rows]) ** 2).sum(axis=-1)
         alike = np.maximum(self.facing @ patches.normals[rows].T, 0.0) ** 2 * np.exp(-apart / (2 * NEARBY_M**2))
@@ -97,7 +100,8 @@ class Emitters:
         dark_patches = GRIDS  # far from all patches, no light arrives
         arriving = alike @ shown / (alike.sum(axis=1) + dark_patches) / GIVEN_ALBEDO
         share = arriving / np.maximum(self.radiance.mean(axis=1), 1e-6)
-        return np.asarray(self.flatness * np.clip((share - UNLIT) / (LIT - UNLIT), 0.0, 1.0))
+        lit = np.clip((share - UNLIT) / (LIT - UNLIT), 0.0, 1.0)
+        return np.asarray(self.flatness * np.maximum(lit, np.clip(2 * self.facing @ up - 1, 0.0, 1.0)))
 
     def solid_angles(self, points: Floats) -> Floats:
         """[n, k] steradians."""

@@ -364,7 +364,9 @@ class _AlbedoSpreads:
 
 def _counts(error: Floats, evidence: Evidence, switches: Switches) -> Floats:
     """[n] weights of the patches, by the error [n] of (1)."""
-    counts = evidence.precision * (_huber(error * np.sqrt(evidence.precision)) if switches.outliers else 1.0)
+    counts = evidence.precision / (1 + (np.maximum(error, 0.0) / weights.LUMINOUS) ** 4)
+    if switches.outliers:
+        counts *= _huber(error * np.sqrt(evidence.precision))
     return np.where(evidence.is_clipped & (error < 0), 0.0, counts)
 
 

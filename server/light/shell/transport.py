@@ -103,7 +103,7 @@ class Transport:
         for first in range(0, len(rows), _AT_ONCE):
             self._update_rays(patches, rows[first : first + _AT_ONCE], shell)
         if len(patches.used):
-            self._update_emitters(patches, bright, patches.used)
+            self._update_emitters(patches, bright, patches.used, shell)
 
     def _update_rays(self, patches: Patches, rows: Ints, shell: Shell) -> None:
         """What evenly spread rays meet, but for saturated surface."""
@@ -143,14 +143,14 @@ class Transport:
         self._bright_shares = np.concatenate([self._bright_shares[others], shares])
         self._bright_ends = np.concatenate([self._bright_ends[others], ends])
 
-    def _update_emitters(self, patches: Patches, bright: EmittersSeen, rows: Ints) -> None:
+    def _update_emitters(self, patches: Patches, bright: EmittersSeen, rows: Ints, shell: Shell) -> None:
         """Saturated surface: each emitter by a ray of its own, what is large or no emitter by evenly spread rays."""
         emitters = bright.emitters
         keys = bright_keys(emitters.centers)
         self._add_cells(keys, is_saturated=True)
         columns = columns_of(self.hidden, keys)
         self._note_clipped(columns, emitters.radiance)
-        self.lit[columns] = emitters.lit_by(patches)
+        self.lit[columns] = emitters.lit_by(patches, shell.axes[2])
         shares = emitters.shares(patches.positions[rows], patches.normals[rows])
         weights = emitters.weights(shares, RAYS // 2)
         sums = self._by_rays[rows].astype(np.float64)

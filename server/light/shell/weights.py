@@ -47,6 +47,9 @@ WHITE = 0.005
 """Deviation of a surface's log albedo above 0: nothing sends back more than it receives."""
 ONE_ALBEDO = 0.01
 """Replaces the spreads if albedo is constant."""
+LUMINOUS = 1.0
+"""Excess of the log radiance over what white surface would show from which a patch is taken to be a light itself (a
+window or a screen that is not clipped), and says nothing of the light that arrives."""
 HUBER = 1.0
 """A patch whose residual exceeds so many standard deviations of the noise counts as an outlier."""
 CELL_LOW, CELL_HIGH, CELL_HIDDEN = 0.47, 2.9, 0.7

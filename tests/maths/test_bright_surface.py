@@ -13,7 +13,7 @@ from server.light.shell.sources import near_sources
 from server.light.shell.transport import bright_keys, columns_of
 from server.maths.sh import spherical_fibonacci
 from tests.scenes.analytic import Floats
-from tests.scenes.shell_room import make_room
+from tests.scenes.shell_room import UP, make_room
 
 EYE = np.array([0.15, 0.15, -2.0])
 MIDDLE = np.array([0.15, 0.15, 0.15])
@@ -135,8 +135,16 @@ def test_bright_surface_nearby_explains_a_clipped_pane(shown: float, lit: float)
     facing = np.tile([0.0, 0.0, -1.0], (x.size, 1))
     patches.add(Seen(at, facing, np.full((x.size, 3), np.log(shown)), np.zeros(x.size), np.zeros(x.size)))
     patches.traced_in[:] = 1
-    assert found(pane(0.0)).lit_by(patches)[0] == lit
-    assert found(bulb()).lit_by(patches)[0] < 0.02
+    assert found(pane(0.0)).lit_by(patches, UP)[0] == lit
+    assert found(bulb()).lit_by(patches, UP)[0] < 0.02
+
+
+@pytest.mark.parametrize(("tilt_deg", "lit"), [(0, 1.0), (45, np.sqrt(2) - 1), (90, 0.0), (180, 0.0)])
+def test_flat_surface_that_faces_up_is_lit(tilt_deg: float, lit: float) -> None:
+    """A table, though nothing around it is known to be bright; not a window, a panel on the ceiling, or a bulb."""
+    up = np.array([np.sin(np.radians(tilt_deg)), 0.0, -np.cos(np.radians(tilt_deg))])
+    assert found(pane(0.0)).lit_by(Patches(), up)[0] == pytest.approx(lit, abs=1e-9)
+    assert found(bulb()).lit_by(Patches(), up)[0] < 0.02
 
 
 @pytest.mark.parametrize("excess", [100.0, 400.0])

@@ -135,6 +135,24 @@ def test_albedos_stay_below_one(lit: ShellRoom) -> None:
     assert np.quantile(albedo, 0.99) < 1.0
 
 
+def test_a_light_that_no_picture_clips_says_nothing_of_what_arrives() -> None:
+    """A screen of 1.2 x 1.2 m on a wall, ten times as bright as white surface would be."""
+    place, lights = np.array([1.0, 1.0, 0.7]), []
+    for is_on in (False, True):
+        room = make_room(LAMP, AMBIENT)
+        patches, used = room.patches, room.patches.used
+        on_wall = used[patches.normals[used, 0] > 0.9]
+        middle = patches.positions[on_wall].mean(axis=0)
+        screen = on_wall[np.abs(patches.positions[on_wall] - middle).max(axis=1) < 0.6]
+        assert len(screen) > 20
+        if is_on:
+            patches.logarithms[screen] = np.log(8.0)
+        room.solve(25)
+        lights.append(light_at(room, place))
+    assert lights[1][0] == pytest.approx(lights[0][0], rel=0.15)  # 19 times as bright while it counted
+    assert angle_deg(lights[1], lights[0]) < 8
+
+
 def test_the_solution_is_a_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the twin of the objective, which has no outliers: no unknown can be moved to a smaller sum."""
     monkeypatch.setattr(weights, "HUBER", np.inf)

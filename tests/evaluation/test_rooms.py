@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from client.options.source import open_source
 from tests.bench.rooms import __main__ as program
 from tests.bench.rooms.furniture import LIGHTS, Room, camera_pose, furnished_room
-from tests.bench.rooms.ground_truth import DEPTH_SCALE_M, HEIGHT, WIDTH, directions, write_room
+from tests.bench.rooms.ground_truth import DEPTH_SCALE_M, FOCAL_PX, HEIGHT, WIDTH, directions, write_room
 from tests.scenes.analytic import Floats
 
 SEEDS = range(12)
@@ -57,8 +58,8 @@ def test_places_are_free_and_the_camera_stays_inside() -> None:
         for what, place in room.places:
             assert is_inside(room, place, 0.0)
             assert not any((np.abs(solid @ [*place, 1.0])[:3] < 1).all() for solid in solids), what
-        for share in np.linspace(0, 1, 7):
-            pose = camera_pose(room, share)
+        for share, turns in product(np.linspace(0, 1, 7), (False, True)):
+            pose = camera_pose(room, share, turns=turns)
             np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
             assert np.linalg.det(pose[:3, :3]) > 0.99
             assert pose[1, 1] > 0.5, "its y axis points down"
@@ -76,6 +77,15 @@ class _Wall:
 
     def light_at(self, place: Floats, _random: np.random.Generator) -> Floats:
         return np.full((16, 3), place[0])
+
+
+def test_a_camera_that_turns_sees_all_walls_and_the_ceiling() -> None:
+    room = rooms()[0]
+    forward = np.array([camera_pose(room, share, turns=True)[:3, 2] for share in np.linspace(0, 1, 61)])
+    turned = np.unwrap(np.arctan2(forward[:, 0], forward[:, 2]))
+    assert abs(turned[-1] - turned[0]) == pytest.approx(2 * np.pi)
+    half_view = HEIGHT / 2 / FOCAL_PX
+    assert np.arcsin(-forward[:, 1].min()) + np.arctan(half_view) > np.radians(30)
 
 
 def test_a_set_is_a_source_with_its_places(tmp_path: Path) -> None:

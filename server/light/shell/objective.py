@@ -31,7 +31,8 @@ beyond the scan, b and w are left out, tau is quadratic above 0, and S_p^2 is la
 (CONTACT_NOISE).
 n_k and m follow between the steps, m from its own two terms: all materials, and b, go along with it, since little else
 of the objective changes where all albedo grows and all light falls. The weights stand in weights.py. A patch that is
-clipped only counts where (1) is below what it shows; its material is the mean one.
+clipped only counts where (1) is below what it shows; its material is the mean one. A patch much brighter than (1), a
+window or a screen, counts 1 / (1 + (e_p / LUMINOUS)^4) for positive e_p.
 """
 
 from __future__ import annotations

@@ -50,6 +50,7 @@ CONSTANTS = (
     Constant("weights", "DARK_EDGE", 0.015, 0.06),
     Constant("weights", "BRIGHT_EDGE", 0.05, 0.2),
     Constant("weights", "WHITE", 0.0025, 0.01),
+    Constant("weights", "LUMINOUS", 0.5, 2.0),
     Constant("weights", "HUBER", 0.5, 2.0),
     Constant("weights", "CELL_LOW", 0.235, 0.94),
     Constant("weights", "CELL_HIGH", 1.45, 5.8),

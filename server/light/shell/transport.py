@@ -24,7 +24,7 @@ HIDDEN_M = 0.6
 """Side of the cells of hidden surface: a piece of furniture. Those of saturated surface are smaller (CELL_M)."""
 MOST_HIDDEN, MOST_SATURATED = 128, 96
 """Most cells of each kind. Surface beyond that shares one more cell of its kind: what is hidden must not send as a lamp
-does. A furnished room has 110 and 60 in a second, the real kitchen 60 and 65 in seven."""
+does. Furnished rooms have up to 110 and 55 in a second, the real kitchen 60 and 55 in four."""
 SATURATED, ALL_CHANNELS = 0.97, 0.9
 """Radiance of the strongest channel from which a picture's values are lower bounds, code 252 of 255, and the share of
 it that the weakest has then: where another channel is not clipped, the surface is hardly brighter than it looks."""

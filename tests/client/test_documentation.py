@@ -40,7 +40,17 @@ EXTRAS = {"--video": ("av", "PyAV"), "--rerun": ("rerun", "rerun-sdk")}
 OPTIONS = {name for command in GROUP.commands.values() for each in command.params for name in each.opts}
 OPTIONS |= {name for command in GROUP.commands.values() for each in command.params for name in each.secondary_opts}
 OPTIONS |= {"--help", "--help-all", "--debug"}
-OPTIONS_OF_OTHERS = {"--background", "--build-arg", "--count", "--from", "--group-add", "--python", "--seed", "--serve"}
+OPTIONS_OF_OTHERS = {
+    "--background",
+    "--build-arg",
+    "--count",
+    "--from",
+    "--group-add",
+    "--python",
+    "--seed",
+    "--serve",
+    "--turn",
+}
 """Of other programs, that sentences name."""
 
 

@@ -67,18 +67,16 @@ class Room:
 def camera_pose(room: Room, share: float, *, turns: bool = False) -> Floats:
     """[4, 4] world_from_camera at a share of the way, from 0 to 1: from the table over to the other side.
 
-    turns: then once around, and up to the ceiling now and then, in the middle of the room.
+    turns: it turns once around instead, and looks up to the ceiling now and then.
     """
-    eased = share * share * (3 - 2 * share)
-    place = [(-0.15 + 0.55 * eased) * room.side, -1.4 + 0.04 * np.sin(7 * share), -1.0 + 0.45 * eased]
-    yaw, pitch = room.side * np.radians(-17 + 57 * eased), np.radians(29 + 1.5 * np.sin(5 * share))
+    y = -1.4 + 0.04 * np.sin(7 * share)
     if turns:
-        place = [
-            (-0.15 + 0.25 * np.sin(np.pi * share)) * room.side,
-            -1.4 + 0.04 * np.sin(7 * share),
-            -1.0 + 0.4 * share,
-        ]
+        place = [(-0.15 + 0.25 * np.sin(np.pi * share)) * room.side, y, -1.0 + 0.4 * share]
         yaw, pitch = room.side * np.radians(-17 + 360 * share), np.radians(14 - 22 * np.sin(6 * np.pi * share))
+    else:
+        eased = share * share * (3 - 2 * share)
+        place = [(-0.15 + 0.55 * eased) * room.side, y, -1.0 + 0.45 * eased]
+        yaw, pitch = room.side * np.radians(-17 + 57 * eased), np.radians(29 + 1.5 * np.sin(5 * share))
     forward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)

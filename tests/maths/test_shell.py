@@ -8,7 +8,7 @@ import pytest
 from server.light.shell import weights
 from server.light.shell.distant import distant_light
 from server.light.shell.evidence import DARKEST, log_chroma, materials_of
-from server.light.shell.objective import Unknowns, step
+from server.light.shell.objective import Unknowns, received, step
 from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights, ray_directions
 from server.light.shell.shell import (
     BEHIND_M,
@@ -195,6 +195,16 @@ def test_the_solution_is_a_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
         ends = [value(z + sign * 0.05 * np.eye(count)[cell], materials, offsets) for sign in (-1, 1)]
         slope, bend = (ends[1] - ends[0]) / 0.1, (ends[1] + ends[0] - 2 * best) / 0.05**2
         assert abs(slope / bend) < 0.02  # the minimum along this cell is nearer than 2 %
+
+
+@pytest.mark.parametrize("known", [KNOWN, 4 * KNOWN])
+def test_the_level_is_found_in_few_steps(known: Floats) -> None:
+    """Where the brightest surface is far brighter than most, m goes a long way, and the light with it."""
+    room = make_room(LAMP, AMBIENT, {0: (0.85, 0.85, 0.8), 1: (0.3, 0.3, 0.25), 2: (0.5, 0.4, 0.3)}, known)
+    room.solve(8)
+    soon = received(room.unknowns, room.near).mean()
+    room.solve(60)
+    assert soon == pytest.approx(received(room.unknowns, room.near).mean(), abs=0.03)  # a logarithm; .2 with m alone
 
 
 def spoilt(case: str) -> ShellRoom:

@@ -29,10 +29,10 @@ count as their chroma is like w_0, white paint's; it sets the level. w is the me
 any chroma, between these ranks. s_t is one along the colours of black bodies, another across them. For the light from
 beyond the scan, b and w are left out, tau is quadratic above 0, and S_p^2 is larger by what is near the patch
 (CONTACT_NOISE).
-n_k and m follow between the steps, m from its own two terms: all materials, and b, go along with it, since little else
-of the objective changes where all albedo grows and all light falls. The weights stand in weights.py. A patch that is
-clipped only counts where (1) is below what it shows; its material is the mean one. A patch much brighter than (1), a
-window or a screen, counts 1 / (1 + (e_p / LUMINOUS)^4) for positive e_p.
+n_k and m follow between the steps. m goes to where its own two terms balance, by Newton steps; how far all else goes
+along with it, and b, is told by the curvature. The weights stand in weights.py. A patch that is clipped only counts
+where (1) is below what it shows; its material is the mean one. A patch much brighter than (1), a window or a screen,
+counts 1 / (1 + (e_p / LUMINOUS)^4) for positive e_p.
 """
 
 from __future__ import annotations
@@ -65,6 +65,8 @@ not in the step's derivatives."""
 TURNING_BACK, GOING_ON = 0.7, 1.1
 MOST_STEP = 3.0
 """Greatest change of an unknown logarithm in a whole step."""
+LEVEL_TRIAL = 0.1
+"""Change of m by which it is tried how far the brightest white surface goes along."""
 BEGIN_EXCESS = np.arange(9.0)
 """Logarithms of excess, over its prior mean, of which new saturated sources begin at the best. A bulb is e^5 times as
 bright as a picture shows it."""
@@ -131,10 +133,13 @@ class Unknowns:
         self.materials += share * (_given_logit(has_materials=switches.albedos) - self.materials)
         self.relaxation, self.last = self.most_relaxation, _empty()
 
-    def solve(self, curvature: Singles, right: Floats) -> Floats:
-        """[k + albedos] the whole Gauss-Newton step; keeps the curvature."""
+    def keep(self, curvature: Singles) -> None:
+        """The curvature of this step."""
         self.curvature = curvature
         self.factor = cho_factor(self.curvature, check_finite=False)
+
+    def solve(self, right: Floats) -> Floats:
+        """[k + albedos] the change to which the slope `right` leads by the curvature."""
         return cho_solve(self.factor, right.astype(np.float32), check_finite=False).astype(np.float64)  # type: ignore[no-any-return]
 
     def solved(self, count: int | None = None) -> Solved:
@@ -202,17 +207,17 @@ def step(
     right[:count] -= _smoothen(matrix, z, sources.pairs)
     bent, pull = _priors(z - prior, sources, unknowns.materials[nodes] - middle, spreads.material)
     matrix[np.diag_indices_from(matrix)] += bent
-    change = unknowns.solve(matrix, right + pull)
+    unknowns.keep(matrix)
+    change = unknowns.solve(right + pull)
     change *= min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
     change *= unknowns.relax(change[:count])
+    paint = _Paint(materials, unknowns.materials[nodes], design, residual, surfaces, evidence)
+    if finds_level:
+        change += _level_step(unknowns, paint, change, seen - sent_chroma, spreads.material)
     unknowns.step = float(np.sqrt(np.mean((parts @ change[:count]) ** 2)))
     unknowns.z = z + change[:count]
     unknowns.materials[nodes] += change[count:]
-    offsets = surfaces.of_surfaces(residual - design @ change)
-    unknowns.offsets[evidence.rows] = offsets[evidence.surfaces]
-    albedos = np.log(_logistic(materials @ unknowns.materials[nodes])) + offsets[evidence.surfaces]
-    if finds_level:
-        _shift_albedos(unknowns, albedos[~evidence.is_clipped], (seen - sent_chroma)[~evidence.is_clipped])
+    unknowns.offsets[evidence.rows] = paint.offsets(change)
     if with_chroma:
         unknowns.chroma = solve_chroma(
             parts,
@@ -220,7 +225,7 @@ def step(
             sent_chroma,
             regions,
             sources.pairs,
-            _brightest(albedos, ~evidence.is_clipped) if finds_level else None,
+            _brightest(paint.albedos(change), ~evidence.is_clipped) if finds_level else None,
             finds_albedos=switches.albedos,
         )
     unknowns.radiance = _radiance(unknowns, sources)
@@ -318,21 +323,57 @@ def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: F
     return np.where(is_new, BEGIN_EXCESS[errors.argmin()], 0.0)
 
 
-def _shift_albedos(unknowns: Unknowns, albedos: Floats, chroma: Floats) -> None:
-    """A step of m and, with it, of all materials; its change of m's log albedo counts in `step`.
+@dataclass(frozen=True)
+class _Paint:
+    """The albedos of n patches before a step, and after it."""
 
-    albedos: [n] logarithms, of patches that are not clipped; chroma: [n, 2] of their albedo.
+    materials: Floats
+    """[n, albedos] B of (1)."""
+    logits: Floats
+    """[albedos] m_g."""
+    design: Singles
+    """[n, k + albedos] derivatives of what patches show."""
+    residual: Floats
+    """[n] of (1), less the prior means of the surfaces' offsets."""
+    surfaces: Offsets
+    evidence: Evidence
+
+    def offsets(self, change: Floats) -> Floats:
+        """[n] the best ones of their surfaces after the `change` [k + albedos]."""
+        offsets = self.surfaces.of_surfaces(self.residual - self.design @ change)
+        return np.asarray(offsets[self.evidence.surfaces])
+
+    def albedos(self, change: Floats) -> Floats:
+        """[n] logarithms."""
+        logits = self.logits + change[-len(self.logits) :]
+        return np.asarray(np.log(_logistic(self.materials @ logits)) + self.offsets(change))
+
+
+def _level_step(unknowns: Unknowns, paint: _Paint, change: Floats, chroma: Floats, spread: float) -> Floats:
+    """[k + albedos] how sources and materials go along with a Newton step of m, which is taken.
+
+    m is to be where its own two terms balance. The rest of the objective lets the albedos go along with m in part
+    only, by what its curvature tells, and the brightest white surface less still. change: of the Gauss-Newton step;
+    chroma: [n, 2] of albedo; spread: s_m.
     """
-    if len(albedos) == 0:
-        return
-    before = _logistic(unknowns.middle)
-    slope = 1 - before  # of a log albedo by its logit
-    missing = np.log(weights.BRIGHTEST) - _brightest_white(albedos, chroma)
-    pull = slope * missing / weights.BRIGHTEST_SPREAD**2 + (LOGIT - unknowns.middle) / weights.MEAN_SPREAD**2
-    change = unknowns.relaxation * pull / ((slope / weights.BRIGHTEST_SPREAD) ** 2 + 1 / weights.MEAN_SPREAD**2)
-    unknowns.middle += change
-    unknowns.materials += change
-    unknowns.step = float(np.hypot(unknowns.step, np.log(_logistic(unknowns.middle) / before)))
+    is_usable = ~paint.evidence.is_clipped
+    if not is_usable.any():
+        return np.zeros_like(change)
+    towards_m = np.zeros(len(change))
+    towards_m[-len(paint.logits) :] = 1 / spread**2
+    along = unknowns.solve(towards_m)
+    brightest, brighter = (
+        _brightest_white(paint.albedos(after)[is_usable], chroma[is_usable])
+        for after in (change, change + LEVEL_TRIAL * along)
+    )
+    slope = 1 - _logistic(unknowns.middle)  # of a log albedo by its logit
+    pull = slope * (np.log(weights.BRIGHTEST) - brightest) / weights.BRIGHTEST_SPREAD**2
+    pull += (LOGIT - unknowns.middle) / weights.MEAN_SPREAD**2
+    gain = max(brighter - brightest, 0.0) / LEVEL_TRIAL
+    step_of_m = pull / (slope * gain / weights.BRIGHTEST_SPREAD**2 + 1 / weights.MEAN_SPREAD**2)
+    step_of_m = unknowns.relaxation * float(np.clip(step_of_m, -MOST_STEP, MOST_STEP))
+    unknowns.middle += step_of_m
+    return step_of_m * along
 
 
 def _brightest_white(albedos: Floats, chroma: Floats) -> float:

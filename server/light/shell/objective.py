@@ -38,7 +38,6 @@ counts 1 / (1 + (e_p / LUMINOUS)^4) for positive e_p.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,16 +47,13 @@ from server.light.shell import weights
 from server.light.shell.chroma import solve_chroma
 from server.light.shell.elimination import Offsets, Regions, add_smoothness
 from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, log_chroma, materials_of
+from server.light.shell.level import LOGIT, Paint, brightest, level_step, logistic
 from server.light.shell.patches import GRIDS, MOST_PATCHES
 from server.light.shell.shell import CELLS, FLOOR
 from server.light.shell.solved import Solved
 from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
 
-LOGIT = float(np.log(weights.MEAN_ALBEDO / (1 - weights.MEAN_ALBEDO)))
-BRIGHTEST_RANKS = np.linspace(0.91, 0.99, 9)
-"""Ranks of the patches, as shares of all, that are the brightest surface: without outliers, and with many patches, so
-that what they show in the mean changes steadily."""
 LEAST_RELAXATION = 0.05
 """Least share of a Gauss-Newton step that is taken. It falls while steps turn back, and rises again, by TURNING_BACK
 and GOING_ON: the albedo that makes a surface white and the chroma that tells its material follow the light, and are
@@ -65,8 +61,6 @@ not in the step's derivatives."""
 TURNING_BACK, GOING_ON = 0.7, 1.1
 MOST_STEP = 3.0
 """Greatest change of an unknown logarithm in a whole step."""
-LEVEL_TRIAL = 0.1
-"""Change of m by which it is tried how far the brightest white surface goes along."""
 BEGIN_EXCESS = np.arange(9.0)
 """Logarithms of excess, over its prior mean, of which new saturated sources begin at the best. A bulb is e^5 times as
 bright as a picture shows it."""
@@ -179,7 +173,7 @@ def step(
     known_logs, known = _known(sources)
     offsets = _means(unknowns.offsets[evidence.rows], evidence.surfaces)
     z = np.concatenate([unknowns.z, prior[unknowns.known :]])
-    z += _begin(z, unknowns.known, evidence, sources, known, np.log(_logistic(middle)) + offsets)
+    z += _begin(z, unknowns.known, evidence, sources, known, np.log(logistic(middle)) + offsets)
     unknowns.chroma = np.concatenate([unknowns.chroma, np.zeros((count - unknowns.known, 2))])
 
     level = _levels(z, sources).astype(np.float32)
@@ -190,7 +184,7 @@ def step(
     seen = evidence.chroma - (known / arriving)[:, None] * known_logs[:, 1:]
     seen = np.where(evidence.is_clipped[:, None], sent_chroma, seen)
     nodes, materials = materials_of(seen - sent_chroma)
-    albedo = _logistic(materials @ unknowns.materials[nodes])
+    albedo = logistic(materials @ unknowns.materials[nodes])
     residual = evidence.level - np.log(arriving) - np.log(albedo)
     error = residual - offsets[evidence.surfaces]
     counts = _counts(error, evidence, switches)
@@ -211,9 +205,9 @@ def step(
     change = unknowns.solve(right + pull)
     change *= min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
     change *= unknowns.relax(change[:count])
-    paint = _Paint(materials, unknowns.materials[nodes], design, residual, surfaces, evidence)
+    paint = Paint(materials, unknowns.materials[nodes], design, residual, surfaces, evidence)
     if finds_level:
-        change += _level_step(unknowns, paint, change, seen - sent_chroma, spreads.material)
+        change += _follow_level(unknowns, paint, change, seen - sent_chroma, spreads.material)
     unknowns.step = float(np.sqrt(np.mean((parts @ change[:count]) ** 2)))
     unknowns.z = z + change[:count]
     unknowns.materials[nodes] += change[count:]
@@ -225,7 +219,7 @@ def step(
             sent_chroma,
             regions,
             sources.pairs,
-            _brightest(paint.albedos(change), ~evidence.is_clipped) if finds_level else None,
+            brightest(paint.albedos(change), ~evidence.is_clipped) if finds_level else None,
             finds_albedos=switches.albedos,
         )
     unknowns.radiance = _radiance(unknowns, sources)
@@ -292,7 +286,7 @@ def _begin_level(unknowns: Unknowns, evidence: Evidence, *, finds_level: bool, h
     has_materials: albedos are found; else all of them are the given one.
     """
     middle = unknowns.middle if finds_level else _given_logit(has_materials=has_materials)
-    unknowns.mean = float(np.log(evidence.mean / (1.0 if finds_level else _logistic(middle))))
+    unknowns.mean = float(np.log(evidence.mean / (1.0 if finds_level else logistic(middle))))
     if unknowns.known == 0:
         unknowns.materials[:] = middle
     return middle
@@ -323,77 +317,18 @@ def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: F
     return np.where(is_new, BEGIN_EXCESS[errors.argmin()], 0.0)
 
 
-@dataclass(frozen=True)
-class _Paint:
-    """The albedos of n patches before a step, and after it."""
+def _follow_level(unknowns: Unknowns, paint: Paint, change: Floats, chroma: Floats, spread: float) -> Floats:
+    """[k + albedos] how sources and materials go along with a step of m, which is taken.
 
-    materials: Floats
-    """[n, albedos] B of (1)."""
-    logits: Floats
-    """[albedos] m_g."""
-    design: Singles
-    """[n, k + albedos] derivatives of what patches show."""
-    residual: Floats
-    """[n] of (1), less the prior means of the surfaces' offsets."""
-    surfaces: Offsets
-    evidence: Evidence
-
-    def offsets(self, change: Floats) -> Floats:
-        """[n] the best ones of their surfaces after the `change` [k + albedos]."""
-        offsets = self.surfaces.of_surfaces(self.residual - self.design @ change)
-        return np.asarray(offsets[self.evidence.surfaces])
-
-    def albedos(self, change: Floats) -> Floats:
-        """[n] logarithms."""
-        logits = self.logits + change[-len(self.logits) :]
-        return np.asarray(np.log(_logistic(self.materials @ logits)) + self.offsets(change))
-
-
-def _level_step(unknowns: Unknowns, paint: _Paint, change: Floats, chroma: Floats, spread: float) -> Floats:
-    """[k + albedos] how sources and materials go along with a Newton step of m, which is taken.
-
-    m is to be where its own two terms balance. The rest of the objective lets the albedos go along with m in part
-    only, by what its curvature tells, and the brightest white surface less still. change: of the Gauss-Newton step;
-    chroma: [n, 2] of albedo; spread: s_m.
+    change: [k + albedos] of the Gauss-Newton step; chroma: [n, 2] of albedo; spread: s_m.
     """
-    is_usable = ~paint.evidence.is_clipped
-    if not is_usable.any():
-        return np.zeros_like(change)
     towards_m = np.zeros(len(change))
     towards_m[-len(paint.logits) :] = 1 / spread**2
     along = unknowns.solve(towards_m)
-    brightest, brighter = (
-        _brightest_white(paint.albedos(after)[is_usable], chroma[is_usable])
-        for after in (change, change + LEVEL_TRIAL * along)
-    )
-    slope = 1 - _logistic(unknowns.middle)  # of a log albedo by its logit
-    pull = slope * (np.log(weights.BRIGHTEST) - brightest) / weights.BRIGHTEST_SPREAD**2
-    pull += (LOGIT - unknowns.middle) / weights.MEAN_SPREAD**2
-    gain = max(brighter - brightest, 0.0) / LEVEL_TRIAL
-    step_of_m = pull / (slope * gain / weights.BRIGHTEST_SPREAD**2 + 1 / weights.MEAN_SPREAD**2)
-    step_of_m = unknowns.relaxation * float(np.clip(step_of_m, -MOST_STEP, MOST_STEP))
-    unknowns.middle += step_of_m
-    return step_of_m * along
-
-
-def _brightest_white(albedos: Floats, chroma: Floats) -> float:
-    """Mean of the log albedos [n] between BRIGHTEST_RANKS of patches that count as their chroma [n, 2] is like white's.
-
-    Others count a little: where nothing is white, the brightest are taken.
-    """
-    off = ((chroma - weights.WHITE_CHROMA) ** 2).sum(axis=1)
-    counts = np.exp(-off / (2 * weights.WHITE_TOLERANCE**2)) + weights.NOT_WHITE
-    order = np.argsort(albedos, kind="stable")
-    ranks = (np.cumsum(counts[order]) - counts[order] / 2) / counts.sum()
-    return float(np.interp(BRIGHTEST_RANKS, ranks, albedos[order]).mean())
-
-
-def _brightest(albedos: Floats, is_usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """[n] patches of the brightest surface, of those that are usable, by logarithms of albedo [n]."""
-    if not is_usable.any():
-        return is_usable
-    least, most = np.quantile(albedos[is_usable], BRIGHTEST_RANKS[[0, -1]])
-    return np.asarray(is_usable & (albedos >= least) & (albedos <= most))
+    wanted = level_step(unknowns.middle, paint, change, along, chroma)
+    taken = unknowns.relaxation * float(np.clip(wanted, -MOST_STEP, MOST_STEP))
+    unknowns.middle += taken
+    return taken * along
 
 
 @dataclass(frozen=True)
@@ -442,10 +377,6 @@ def _radiance(unknowns: Unknowns, sources: Sources) -> Floats:
     """[k, 3] RGB of sources."""
     logs = np.concatenate([np.log(_levels(unknowns.z, sources))[:, None], unknowns.chroma], axis=1)
     return np.asarray(np.exp(logs @ _FROM_CHROMA.T))
-
-
-def _logistic(logit: Any) -> Any:
-    return 1 / (1 + np.exp(-logit))
 
 
 def _huber(ratio: Floats) -> Floats:

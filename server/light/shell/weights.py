@@ -8,7 +8,7 @@ MEAN_ALBEDO, MEAN_SPREAD = 0.33, 0.3
 """Mean reflectance of a room's materials, with furniture and floors, and the standard deviation of its logit from
 room to room: two thirds lie from .27 to .4."""
 BRIGHTEST, BRIGHTEST_SPREAD = 0.6, 0.07
-"""Albedo of a room's brightest white surface (BRIGHTEST_RANKS in objective.py), and the standard deviation of its
+"""Albedo of a room's brightest white surface (BRIGHTEST_RANKS in level.py), and the standard deviation of its
 logarithm: it sets the level of the light. In fifteen of sixteen rooms it differs by 9 %, the brightest of any colour by
 12 %, mean albedo by 22 %. White paint is .8, but little of a room is as white."""
 GIVEN_ALBEDO = 0.6

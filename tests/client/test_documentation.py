@@ -49,6 +49,7 @@ OPTIONS_OF_OTHERS = {
     "--python",
     "--seed",
     "--serve",
+    "--large",
     "--turn",
 }
 """Of other programs, that sentences name."""

@@ -19,7 +19,7 @@ SEEDS = range(12)
 
 
 def rooms(light: str = "ceiling") -> list[Room]:
-    return [furnished_room(seed, light) for seed in SEEDS]
+    return [furnished_room(seed, light, is_large=is_large) for seed, is_large in product(SEEDS, (False, True))]
 
 
 def is_inside(room: Room, place: Floats, margin: float) -> bool:
@@ -34,6 +34,13 @@ def test_a_seed_is_a_room() -> None:
         np.testing.assert_array_equal(shape.world_from_shape, same.world_from_shape)
         np.testing.assert_array_equal(shape.albedo, same.albedo)
     assert (one.size != other.size).all()
+
+
+def test_walls_of_a_large_room_are_a_metre_farther() -> None:
+    room, large = (furnished_room(3, "lamp", is_large=is_large) for is_large in (False, True))
+    np.testing.assert_allclose(large.size - room.size, [2, 0, 2])
+    for (_, place), (_, same) in zip(room.places[:4], large.places[:4], strict=True):
+        np.testing.assert_array_equal(place, same)
 
 
 @pytest.mark.parametrize("light", LIGHTS)

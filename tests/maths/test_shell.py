@@ -8,6 +8,7 @@ import pytest
 from server.light.shell import weights
 from server.light.shell.distant import distant_light
 from server.light.shell.evidence import DARKEST, log_chroma, materials_of
+from server.light.shell.level import LOGIT
 from server.light.shell.objective import Unknowns, received, step
 from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights, ray_directions
 from server.light.shell.shell import (
@@ -205,6 +206,15 @@ def test_the_level_is_found_in_few_steps(known: Floats) -> None:
     soon = received(room.unknowns, room.near).mean()
     room.solve(24)
     assert soon == pytest.approx(received(room.unknowns, room.near).mean(), abs=0.03)  # a logarithm; .2 with m alone
+
+
+def test_materials_of_no_patch_go_along_with_the_level() -> None:
+    """A patch whose material no other has begins at the mean of the materials, not at one of seconds ago."""
+    room = make_room(LAMP, AMBIENT, {0: (0.85, 0.85, 0.8), 1: (0.3, 0.3, 0.25), 2: (0.5, 0.4, 0.3)}, KNOWN)
+    room.solve(8)
+    unknowns, corner = room.unknowns, 0  # of the grid: far more saturated than any patch
+    assert abs(unknowns.middle - LOGIT) > 0.1
+    assert unknowns.materials[corner] == pytest.approx(unknowns.middle)
 
 
 def spoilt(case: str) -> ShellRoom:

@@ -64,6 +64,7 @@ MOST_STEP = 3.0
 BEGIN_EXCESS = np.arange(9.0)
 """Logarithms of excess, over its prior mean, of which new saturated sources begin at the best. A bulb is e^5 times as
 bright as a picture shows it."""
+ALL_NODES = np.arange(NODES * NODES)
 _FROM_CHROMA = np.linalg.inv(LOG_CHROMA)
 
 Floats = NDArray[np.float64]
@@ -83,7 +84,7 @@ class Unknowns:
     """[k] log radiance of sources; of saturated ones, of their relative excess."""
     chroma: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """[k, 2]."""
-    materials: Floats = field(default_factory=lambda: np.full(NODES * NODES, LOGIT))
+    materials: Floats = field(default_factory=lambda: np.full(len(ALL_NODES), LOGIT))
     """[nodes] logit of albedo."""
     offsets: Floats = field(default_factory=lambda: np.zeros(MOST_PATCHES))
     """[MOST_PATCHES] o of the surface that each patch is part of."""
@@ -207,7 +208,7 @@ def step(
     change *= unknowns.relax(change[:count])
     paint = Paint(materials, unknowns.materials[nodes], design, residual, surfaces, evidence)
     if finds_level:
-        change += _follow_level(unknowns, paint, change, seen - sent_chroma, spreads.material)
+        change += _follow_level(unknowns, nodes, paint, change, seen - sent_chroma, spreads.material)
     unknowns.step = float(np.sqrt(np.mean((parts @ change[:count]) ** 2)))
     unknowns.z = z + change[:count]
     unknowns.materials[nodes] += change[count:]
@@ -317,10 +318,13 @@ def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: F
     return np.where(is_new, BEGIN_EXCESS[errors.argmin()], 0.0)
 
 
-def _follow_level(unknowns: Unknowns, paint: Paint, change: Floats, chroma: Floats, spread: float) -> Floats:
+def _follow_level(
+    unknowns: Unknowns, nodes: Ints, paint: Paint, change: Floats, chroma: Floats, spread: float
+) -> Floats:
     """[k + albedos] how sources and materials go along with a step of m, which is taken.
 
-    change: [k + albedos] of the Gauss-Newton step; chroma: [n, 2] of albedo; spread: s_m.
+    Materials of no patch go along whole: nothing else holds them. nodes: [albedos] of the patches' materials; change:
+    [k + albedos] of the Gauss-Newton step; chroma: [n, 2] of albedo; spread: s_m.
     """
     towards_m = np.zeros(len(change))
     towards_m[-len(paint.logits) :] = 1 / spread**2
@@ -328,6 +332,7 @@ def _follow_level(unknowns: Unknowns, paint: Paint, change: Floats, chroma: Floa
     wanted = level_step(unknowns.middle, paint, change, along, chroma)
     taken = unknowns.relaxation * float(np.clip(wanted, -MOST_STEP, MOST_STEP))
     unknowns.middle += taken
+    unknowns.materials[np.setdiff1d(ALL_NODES, nodes)] += taken
     return taken * along
 
 

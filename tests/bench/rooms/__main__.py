@@ -25,6 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--samples", type=int, default=16, help="rays of a pixel, before the pictures are denoised")
     parser.add_argument("--turn", action="store_true", help="the camera turns once around, and sees the ceiling")
+    parser.add_argument("--large", action="store_true", help="walls a metre farther from the cameras")
     asked = parser.parse_args(arguments)
     if asked.folder.exists():
         return _refuse(f"{asked.folder} exists: name a folder that does not")
@@ -35,7 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
         return _refuse(f"{', '.join(missing)} not installed: pip install mitsuba==3.5.2 pyoidn cffi")
     from tests.bench.rooms.tracing import TracedRoom, denoised
 
-    room = furnished_room(asked.seed, asked.light)
+    room = furnished_room(asked.seed, asked.light, is_large=asked.large)
     traced = TracedRoom(room)
     write_room(
         asked.folder, room, traced, asked.seed, asked.frames, asked.samples, _say, denoise=denoised, turns=asked.turn

@@ -18,6 +18,8 @@ Kind = Literal["cube", "rectangle", "sphere"]
 
 TEXELS = 256
 """Along a side of a texture."""
+LARGER_M = np.array([2.0, 0.0, 2.0])
+"""By how much a large room is larger: its walls are a metre farther from what stands in its middle."""
 TABLE_M = 0.74
 """Height of the table's top."""
 WARM, COOL, WHITE = np.array([1.0, 0.72, 0.42]), np.array([0.75, 0.9, 1.15]), np.array([1.0, 0.93, 0.82])
@@ -85,10 +87,12 @@ def camera_pose(room: Room, share: float, *, turns: bool = False) -> Floats:
     return pose
 
 
-def furnished_room(seed: int, light: str) -> Room:
+def furnished_room(seed: int, light: str, *, is_large: bool = False) -> Room:
     """A room with one of the LIGHTS. Raises KeyError for another."""
     random = np.random.default_rng(seed)
     size = np.array([random.uniform(3.4, 5.2), random.uniform(2.4, 2.8), random.uniform(3.6, 5.2)])
+    if is_large:
+        size += LARGER_M
     room = Room(size, float(random.choice([-1.0, 1.0])))
     builder = _Builder(room, random)
     builder.walls()

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from server.light.shell.patches import PATCH_M
-from server.light.shell.shell import BEHIND_M, CAMERA_M, WALL_M, closed_sides, shell_around
+from server.light.shell.shell import BEHIND_M, CAMERA_M, WALL_M, closed_sides
 from tests.scenes.analytic import Floats
 from tests.scenes.shell_room import UP
+from tests.scenes.shells import shell_of
 
 PLACE = np.stack(np.meshgrid(np.arange(0.05, 2, 0.15), np.arange(0.05, 2, 0.15)), -1).reshape(-1, 2)
 FLOOR = np.column_stack([PLACE, np.zeros(len(PLACE))])
@@ -42,7 +43,7 @@ def test_scanned_walls_close_their_sides() -> None:
     camera, to_wall = np.array([[0.3, 1.0, 1.5]]), np.array([[-1.0, 0.0, 0.0]])
     behind_m = BEHIND_M + CAMERA_M
     for facing, has_walls, distance_m in ((normals, True, 0.3), (-normals, True, behind_m), (normals, False, behind_m)):
-        shell = shell_around(points, facing, camera, UP, PATCH_M2, None, has_walls=has_walls)
+        shell = shell_of(points, facing, camera, UP, PATCH_M2, has_walls=has_walls)
         assert shell.distances(camera, to_wall).min() == pytest.approx(distance_m, abs=0.01)
 
 

@@ -19,7 +19,6 @@ from server.light.shell.shell import (
     SIDES,
     Shell,
     neighbours,
-    shell_around,
     upright,
     wall_axes,
 )
@@ -44,6 +43,7 @@ from tests.scenes.shell_room import (
     sent,
     sky,
 )
+from tests.scenes.shells import shell_of
 
 LAMP = Lamp((3.0, 0.9), 0.7, (16.0, 15.0, 14.0))
 AMBIENT = (0.3, 0.3, 0.3)
@@ -324,14 +324,14 @@ def test_up_is_as_given_where_nothing_faces_up() -> None:
 
 def test_the_box_holds_scan_cameras_and_a_ceiling() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0.5], [0, 1, 0.2]])
-    shell = shell_around(points, np.tile(UP, (4, 1)), CAMERA[None], UP, PATCH_M**2, None)
+    shell = shell_of(points, np.tile(UP, (4, 1)), CAMERA[None], UP, PATCH_M**2)
     camera = shell.axes @ CAMERA
     assert (shell.low[:2] <= camera[:2] - BEHIND_M + 1e-9).all() or (camera[:2] - BEHIND_M > shell.low[:2]).all()
     assert (shell.high[:2] >= camera[:2] + BEHIND_M - 1e-9).all()
     assert shell.high[2] - shell.floor_m >= LEAST_HEIGHT_M - 1e-9
-    again = shell_around(points + 0.01, np.tile(UP, (4, 1)), CAMERA[None], UP, PATCH_M**2, shell)
+    again = shell_of(points + 0.01, np.tile(UP, (4, 1)), CAMERA[None], UP, PATCH_M**2, shell)
     assert again is shell  # noise moves nothing
-    grown = shell_around(points, np.tile(UP, (4, 1)), CAMERA[None] + SIZE_M, UP, PATCH_M**2, shell)
+    grown = shell_of(points, np.tile(UP, (4, 1)), CAMERA[None] + SIZE_M, UP, PATCH_M**2, shell)
     assert (grown.high[:2] > shell.high[:2]).all()
     assert (grown.low[:2] <= camera[:2] - BEHIND_M + 0.1).all()  # the first camera's place is remembered
 

@@ -215,7 +215,7 @@ def test_systems_without_children_solve_here(
 
 def test_an_error_of_the_solver_is_told(solver: SolverProcess, tasks: list[Task]) -> None:
     wrong = replace(tasks[0], up=np.zeros(2))
-    with pytest.raises(RuntimeError, match=r"could not be solved(.|\n)*Traceback(.|\n)*shell_around"):
+    with pytest.raises(RuntimeError, match=r"could not be solved(.|\n)*Traceback(.|\n)*room_axes"):
         solver.solve(wrong)
     assert solver.solve(tasks[0]) is not None, "the next is solved"
 

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from server.light.shell.patches import Patches, hemisphere_weights, ray_directions
 from server.light.shell.picture import Seen
-from server.light.shell.shell import Shell, shell_around
+from server.light.shell.shell import Shell
 from server.light.shell.transport import Transport
 from tests.scenes.analytic import Floats
 from tests.scenes.shell_room import CAMERA, NO_EMITTERS, SIZE_M, SPACING_M, UP
+from tests.scenes.shells import shell_of
 
 LIGHT, REST = 4.0, 0.35
 """Radiance of the wall x = SIZE_M[0], and of the other walls and the ceiling."""
@@ -61,7 +62,7 @@ def half_floor_room() -> tuple[Patches, Transport, Shell]:
     order = np.array([np.abs(at - position).sum(1).argmin() for position in patches.positions[rows]])
     patches.traced_normals[rows], patches.arrivals[rows] = patches.normals[rows], arrivals[order]
     patches.traced_in[rows] = 1
-    shell = shell_around(at, facing, np.stack([CAMERA, SIZE_M - 0.5]), UP, patches.area_m2, None)
+    shell = shell_of(at, facing, np.stack([CAMERA, SIZE_M - 0.5]), UP, patches.area_m2)
     transport = Transport()
     transport.update(patches, NO_EMITTERS, rows, shell)
     return patches, transport, shell

@@ -13,11 +13,12 @@ from server.light.shell.evidence import Evidence, evidence_of
 from server.light.shell.objective import Unknowns, step
 from server.light.shell.patches import RAYS, Patches, hemisphere_weights, ray_directions
 from server.light.shell.picture import Seen
-from server.light.shell.shell import Shell, closed_sides, shell_around
+from server.light.shell.shell import Shell, closed_sides
 from server.light.shell.sources import Sources, distant_sources, near_sources
 from server.light.shell.switches import Switches
 from server.light.shell.transport import Transport
 from tests.scenes.analytic import Floats
+from tests.scenes.shells import shell_of
 
 SIZE_M = np.array([4.0, 3.6, 2.4])
 CAMERA = np.array([3.0, 2.6, 1.5])
@@ -131,7 +132,7 @@ def make_room(
     order = np.array([np.abs(at + 1e-4 - position).sum(1).argmin() for position in patches.positions[rows]])
     patches.traced_normals[rows], patches.arrivals[rows] = patches.normals[rows], arrivals[order]
     patches.traced_in[rows] = 1
-    shell = shell_around(at, facing, np.stack([CAMERA, SIZE_M - 1.0]), UP, patches.area_m2, None)
+    shell = shell_of(at, facing, np.stack([CAMERA, SIZE_M - 1.0]), UP, patches.area_m2)
     transport = Transport()
     transport.update(patches, NO_EMITTERS, rows, shell)
     return ShellRoom(patches, transport, shell, Unknowns())

@@ -76,16 +76,19 @@ class Emitters:
 
     def seen_from(self, points: Floats) -> tuple[Floats, Floats, Floats]:
         """Unit directions [n, k, 3] from `points` [n, 3], distances [n, k] and areas across them [n, k]."""
-        away = self.centers[None] - points[:, None]
-        distances = np.maximum(np.linalg.norm(away, axis=-1), 1e-6)
-        directions = away / distances[..., None]
-        cosines = np.maximum(-np.einsum("nkr,kr->nk", directions, self.facing), 0.0)
-        return directions, distances, self.areas_m2 * ((1 - self.flatness) + self.flatness * cosines)
+        distances, areas = self._apart(points)
+        return (self.centers[None] - points[:, None]) / distances[..., None], distances, areas
+
+    def _apart(self, points: Floats) -> tuple[Floats, Floats]:
+        """Distances [n, k] from `points` [n, 3] and areas across them [n, k]."""
+        distances = np.sqrt(np.maximum(_squared_distances(points, self.centers), 1e-12))
+        cosines = np.maximum(points @ self.facing.T - (self.centers * self.facing).sum(axis=1), 0.0) / distances
+        return distances, self.areas_m2 * ((1 - self.flatness) + self.flatness * cosines)
 
     def shares(self, points: Floats, normals: Floats) -> Floats:
         """[n, k] that emitters fill of the cosine-weighted hemispheres of `points` with unit `normals`, [n, 3] each."""
-        directions, distances, areas = self.seen_from(points)
-        cosines = np.maximum(np.einsum("nkr,nr->nk", directions, normals), 0.0)
+        distances, areas = self._apart(points)
+        cosines = np.maximum(normals @ self.centers.T - (normals * points).sum(axis=1)[:, None], 0.0) / distances
         return np.asarray(cosines * areas / (np.pi * distances**2 + areas))
 
     def lit_by(self, patches: Patches, up: Floats) -> Floats:
@@ -94,8 +97,8 @@ class Emitters:
         Flat surface that faces up is lit: a table, a floor. up: [3] unit, world.
         """
         rows = patches.used[patches.clipped[patches.used] < 0.5]
-        apart = ((self.centers[:, None] - patches.positions[rows]) ** 2).sum(axis=-1)
-        alike = np.maximum(self.facing @ patches.normals[rows].T, 0.0) ** 2 * np.exp(-apart / (2 * NEARBY_M**2))
+        near = np.exp(-_squared_distances(self.centers, patches.positions[rows]) / (2 * NEARBY_M**2))
+        alike = np.maximum(self.facing @ patches.normals[rows].T, 0.0) ** 2 * near
         shown = np.exp(patches.logarithms[rows].mean(axis=1))
         dark_patches = GRIDS  # far from all patches, no light arrives
         arriving = alike @ shown / (alike.sum(axis=1) + dark_patches) / GIVEN_ALBEDO
@@ -105,7 +108,7 @@ class Emitters:
 
     def solid_angles(self, points: Floats) -> Floats:
         """[n, k] steradians."""
-        _, distances, areas = self.seen_from(points)
+        distances, areas = self._apart(points)
         return np.asarray(areas / (distances**2 + areas / (2 * np.pi)))
 
     def weights(self, shares: Floats, rays: int) -> Floats:
@@ -125,7 +128,7 @@ class Emitters:
     def visible(self, volume: Volume, points: Floats, arrivals: NDArray[np.float32]) -> NDArray[np.bool_]:
         """[n, k] whether nothing stands between `points` [n, 3] and an emitter. arrivals: [n, k, 4] what rays towards
         the emitters met, as of trace_arrivals."""
-        _, distances, areas = self.seen_from(points)
+        distances, areas = self._apart(points)
         met = np.abs(arrivals[..., 3])
         own = np.sqrt(areas) + 2 * volume.voxel_m  # what is as near to its middle is the emitter itself
         return np.asarray((met == 0) | (met >= distances - own))
@@ -200,10 +203,9 @@ class BrightSurface:
         rows = np.array([*self._rows.values()])
         is_shown = np.array([key in shown for key in self._rows])
         centers = self._centers[rows] / np.maximum(self._squares[rows], 1e-12)[:, None]
-        # |p - c|^2 as |p|^2 - 2 p c + |c|^2: one product of matrices, good to a micrometre.
-        apart = ((positions**2).sum(axis=1) - 2 * centers @ positions.T).min(axis=1, initial=np.inf)
+        apart = _squared_distances(centers, positions).min(axis=1, initial=np.inf)
         areas = self._squares[rows] / np.maximum(self._areas[rows], 1e-12)
-        is_in_view = is_shown | (apart + (centers**2).sum(axis=1) <= areas / np.pi)
+        is_in_view = is_shown | (apart <= areas / np.pi)
         rows, is_shown = rows[is_in_view], is_shown[is_in_view]
         self._frames[rows] = np.minimum(self._frames[rows] + 1, PRESENCE)
         self._presence[rows] += (is_shown - self._presence[rows]) / self._frames[rows]
@@ -300,6 +302,12 @@ def _by_cell(bright: SeenBright, cells: Ints, count: int) -> SeenBright:
     flatness = _flatness(lengths)
     cosines = np.maximum(-(normal * line).sum(axis=1) / np.maximum(lengths, 1e-6), _LEAST_COSINE)
     return SeenBright(center, normal, radiance, across / (1 - flatness + flatness * cosines), bright.eye)
+
+
+def _squared_distances(points: Floats, others: Floats) -> Floats:
+    """[n, m] between points [n, 3] and [m, 3]: |p|^2 - 2 p q + |q|^2 takes one product of matrices."""
+    squares = (points**2).sum(axis=1)[:, None] - 2 * points @ others.T + (others**2).sum(axis=1)
+    return np.asarray(squares)
 
 
 def _keys(points: Floats) -> Ints:

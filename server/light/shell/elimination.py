@@ -8,6 +8,7 @@ closed form given all else. Of the sums over GRIDS grids, of patches and of prio
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,9 @@ from scipy.sparse import csr_matrix
 
 from server.light.shell.evidence import Evidence
 from server.light.shell.patches import GRIDS
+
+MANY_USED = 0.9
+"""Up to this share of columns that are not 0 throughout, these are worth picking out."""
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -91,15 +95,26 @@ class Offsets:
         With the share a of a region's sums taken from each of its patches, products of what is left sum to
         sum_p w_p x_p y_p - (2 a - a^2 W) (sum_p w_p x_p) (sum_p w_p y_p), W the region's total of weights w_p.
         """
+        sums = self.regions.sums
+        used = np.flatnonzero(sums.any(axis=0))
+        if len(used) > MANY_USED * sums.shape[1]:
+            return self._equations(design, sums, residuals)
+        matrix = np.zeros((sums.shape[1], sums.shape[1]), np.float32)
+        vector = np.zeros((sums.shape[1], residuals.shape[1]), np.float32)
+        matrix[np.ix_(used, used)], vector[used] = self._equations(design[:, used], sums[:, used], residuals)
+        return matrix, vector
+
+    def _equations(self, design: Singles, sums: Singles, residuals: Floats) -> tuple[Singles, Singles]:
+        """As of normal_equations. sums: [regions, c] those of `design`."""
         regions, several = self.regions, self._has_several
         keeps, alone = self.keeps, ~several[self.regions.surfaces]
         factor = self.of_region * keeps + np.where(alone, self.factor[regions.surfaces] * keeps**2, 0.0)
         taken = factor / (1 + np.sqrt(1 - regions.totals * factor))  # the a whose 2 a - a^2 W is `factor`
         differences = regions.sums_of(residuals)
-        left = self._less(design, regions.sums, taken)
+        left = self._less(design, sums, taken)
         matrix = left.T @ left
         vector = left.T @ self._less(residuals.astype(np.float32), differences, taken)
-        root, of_surfaces = np.sqrt(self.factor[several])[:, None], self._sums(regions.sums)[several]
+        root, of_surfaces = np.sqrt(self.factor[several])[:, None], self._sums(sums)[several]
         of_surfaces *= root.astype(np.float32)
         matrix -= of_surfaces.T @ of_surfaces
         vector -= of_surfaces.T @ (root * self._sums(differences)[several]).astype(np.float32)
@@ -118,15 +133,20 @@ class Offsets:
         sums = self._sums(self.regions.sums_of(residuals))
         return np.asarray((sums.T * self.factor + self.center).T)
 
-    @property
+    @cached_property
     def _has_several(self) -> NDArray[np.bool_]:
         """[surfaces] regions; of a single one both offsets are eliminated at once."""
         return np.asarray(np.bincount(self.regions.surfaces, minlength=len(self.factor)) > 1)
 
+    @cached_property
+    def _kept(self) -> csr_matrix:
+        """[surfaces, regions] what is kept of each one's regions."""
+        starts = np.searchsorted(self.regions.surfaces, np.arange(len(self.factor) + 1))
+        return _members(self.keeps, starts)
+
     def _sums(self, by_region: NDArray[Any]) -> NDArray[Any]:
         """[surfaces, ...] of sums over regions [regions, ...]."""
-        starts = np.searchsorted(self.regions.surfaces, np.arange(len(self.factor) + 1))
-        return np.asarray(_members(self.keeps, starts) @ by_region)
+        return np.asarray(self._kept @ by_region)
 
 
 def add_smoothness(matrix: Singles, pairs: Ints, strength: Floats | float) -> None:

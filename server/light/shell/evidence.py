@@ -95,7 +95,9 @@ def materials_of(chroma: Floats) -> tuple[Ints, Floats]:
         for above in (0, 1):
             columns.append((low[:, 0] + right) * NODES + low[:, 1] + above)
             weights.append(np.abs(1 - right - share[:, 0]) * np.abs(1 - above - share[:, 1]))
-    nodes, inverse = np.unique(np.stack(columns, axis=1), return_inverse=True)
-    result = np.zeros((len(chroma), len(nodes)))
-    np.add.at(result, (np.arange(len(chroma))[:, None], inverse.reshape(-1, 4)), np.stack(weights, axis=1))
-    return nodes, result
+    found = np.stack(columns, axis=1)
+    is_used = np.bincount(found.ravel(), minlength=NODES * NODES) > 0
+    nodes, number = np.flatnonzero(is_used), np.cumsum(is_used) - 1
+    entries = np.arange(len(chroma))[:, None] * len(nodes) + number[found]
+    sums = np.bincount(entries.ravel(), np.stack(weights, axis=1).ravel(), len(chroma) * len(nodes))
+    return nodes, np.asarray(sums.reshape(len(chroma), len(nodes)), np.float64)

@@ -45,7 +45,7 @@ class Paint:
 
     def offsets(self, change: Floats) -> Floats:
         """[n] the best ones of their surfaces after the `change` [k + albedos]."""
-        offsets = self.surfaces.of_surfaces(self.residual - self.design @ change)
+        offsets = self.surfaces.of_surfaces(self.residual - self.design @ change.astype(np.float32))
         return np.asarray(offsets[self.evidence.surfaces])
 
     def albedos(self, change: Floats) -> Floats:

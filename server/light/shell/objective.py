@@ -46,7 +46,7 @@ from scipy.linalg import cho_factor, cho_solve
 from server.light.shell import weights
 from server.light.shell.chroma import solve_chroma
 from server.light.shell.elimination import Offsets, Regions, add_smoothness
-from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, log_chroma, materials_of
+from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, materials_of
 from server.light.shell.level import LOGIT, Paint, brightest, level_step, logistic
 from server.light.shell.patches import GRIDS, MOST_PATCHES
 from server.light.shell.shell import CELLS, FLOOR
@@ -171,7 +171,7 @@ def step(
     finds_level = switches.albedos and sources.finds_level
     middle = _begin_level(unknowns, evidence, finds_level=finds_level, has_materials=switches.albedos)
     prior = _prior(unknowns, sources)
-    known_logs, known = _known(sources)
+    known = sources.known_level
     offsets = _means(unknowns.offsets[evidence.rows], evidence.surfaces)
     z = np.concatenate([unknowns.z, prior[unknowns.known :]])
     z += _begin(z, unknowns.known, evidence, sources, known, np.log(logistic(middle)) + offsets)
@@ -180,18 +180,18 @@ def step(
     level = _levels(z, sources).astype(np.float32)
     arriving = np.maximum(sources.shares @ level + known, DARKEST)
     _set_floor_prior(prior, level, evidence.level - np.log(arriving), ~evidence.is_clipped, sources)
-    parts = _parts(sources.shares, level, arriving)
-    sent_chroma = (parts @ unknowns.chroma.astype(np.float32)).astype(np.float64)
-    seen = evidence.chroma - (known / arriving)[:, None] * known_logs[:, 1:]
+    sent_chroma = sources.shares @ (level[:, None] * unknowns.chroma.astype(np.float32)) / arriving[:, None]
+    seen = evidence.chroma - (known / arriving)[:, None] * sources.known_logs[:, 1:]
     seen = np.where(evidence.is_clipped[:, None], sent_chroma, seen)
     nodes, materials = materials_of(seen - sent_chroma)
     albedo = logistic(materials @ unknowns.materials[nodes])
     residual = evidence.level - np.log(arriving) - np.log(albedo)
     error = residual - offsets[evidence.surfaces]
     counts = _counts(error, evidence, switches)
-    counts[(known == 0) & (sources.shares.sum(axis=1) <= sources.least_share)] = 0.0
+    counts[sources.says_nothing] = 0.0
 
-    design = np.concatenate([parts, ((1 - albedo)[:, None] * materials).astype(np.float32)], axis=1)
+    design = _design(sources.shares, level, arriving, (1 - albedo)[:, None] * materials)
+    parts = design[:, :count]
     spreads = _albedo_spreads(switches, finds_level=finds_level)
     regions = Regions.of(design, counts, evidence)
     whitest = -_means(np.log(albedo), evidence.surfaces)
@@ -209,7 +209,7 @@ def step(
     paint = Paint(materials, unknowns.materials[nodes], design, residual, surfaces, evidence)
     if finds_level:
         change += _follow_level(unknowns, nodes, paint, change, seen - sent_chroma, spreads.material)
-    unknowns.step = float(np.sqrt(np.mean((parts @ change[:count]) ** 2)))
+    unknowns.step = float(np.sqrt(np.mean((parts @ change[:count].astype(np.float32)) ** 2)))
     unknowns.z = z + change[:count]
     unknowns.materials[nodes] += change[count:]
     unknowns.offsets[evidence.rows] = paint.offsets(change)
@@ -230,13 +230,7 @@ def received(unknowns: Unknowns, sources: Sources) -> Floats:
     """[n] the logarithm of (1) without albedo: what patches receive. Sources that are new are at their prior."""
     z = np.concatenate([unknowns.z, _prior(unknowns, sources)[unknowns.known :]])
     level = _levels(z, sources).astype(np.float32)
-    return np.log(np.maximum(sources.shares @ level + _known(sources)[1], DARKEST))
-
-
-def _known(sources: Sources) -> tuple[Floats, Floats]:
-    """[n, 3] as of log_chroma of what photographed surface brings, and [n] its level; 0 where there is none."""
-    logs = log_chroma(np.log(np.maximum(sources.known, DARKEST)))
-    return logs, np.where(sources.known.max(axis=1) > 0, np.exp(logs[:, 0]), 0.0)
+    return np.log(np.maximum(sources.shares @ level + sources.known_level, DARKEST))
 
 
 def _prior(unknowns: Unknowns, sources: Sources) -> Floats:
@@ -258,11 +252,14 @@ def _priors(above: Floats, sources: Sources, materials: Floats, spread: float) -
     return bent, pull
 
 
-def _parts(shares: Singles, level: Singles, arriving: Floats) -> Singles:
-    """[n, k] T of (2)."""
-    parts = shares * level
+def _design(shares: Singles, level: Singles, arriving: Floats, of_albedos: Floats) -> Singles:
+    """[n, k + albedos] T of (2), beside it `of_albedos` [n, albedos], the derivatives of log albedo."""
+    design = np.empty((len(shares), len(level) + of_albedos.shape[1]), np.float32)
+    parts = design[:, : len(level)]
+    np.multiply(shares, level, out=parts)
     parts /= arriving.astype(np.float32)[:, None]
-    return parts
+    design[:, len(level) :] = of_albedos
+    return design
 
 
 def _set_floor_prior(

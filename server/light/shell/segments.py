@@ -28,8 +28,8 @@ def segments(keys: Ints, colors: Floats) -> Ints:
     order = np.argsort(number)
     keys, number = keys[order], number[order]
     first, second = [], []
-    for offset in _OFFSETS:
-        wanted = key_numbers(keys + np.pad(offset, (0, keys.shape[1] - 3)))
+    for offset in np.pad(_OFFSETS, ((0, 0), (0, keys.shape[1] - 3))):
+        wanted = key_numbers(keys + offset)
         place = np.minimum(np.searchsorted(number, wanted), len(keys) - 1)
         found = number[place] == wanted
         first.append(order[found])

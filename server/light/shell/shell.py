@@ -211,28 +211,23 @@ def _step(x: Any) -> Any:
     return x * x * (3 - 2 * x)
 
 
-def shell_around(
-    positions: Floats,
-    normals: Floats,
-    cameras: Floats,
-    up: Floats,
-    patch_m2: float,
-    before: Shell | None,
-    *,
-    has_walls: bool = True,
-) -> Shell:
+def room_axes(normals: Floats, up: Floats, before: Shell | None) -> Floats:
+    """[3, 3] Shell.axes: those of the last shell, or by surface that faces `normals` [n, 3]; up: [3] unit, world."""
+    return wall_axes(normals, upright(normals, up)) if before is None else before.axes
+
+
+def shell_around(positions: Floats, cameras: Floats, axes: Floats, closed: Floats, before: Shell | None) -> Shell:
     """The shell around `positions` [n, 3] of surface and `cameras` [m, 3], world metres.
 
-    before: the last one, returned unless the shell has changed by more than noise makes. patch_m2, has_walls: see
-    closed_sides.
+    axes: of room_axes; closed: [SIDES] of closed_sides. before: the last one, returned unless the shell has changed by
+    more than noise makes.
     """
-    axes = wall_axes(normals, upright(normals, up)) if before is None else before.axes
     low, high = _ends(positions @ axes.T)
     floor_m = float(low[2])
     seen_from = cameras @ axes.T
     if before is not None:
         seen_from = np.concatenate([seen_from, before.cameras])
-    open_share = 1.0 - closed_sides(positions, normals, axes, patch_m2, has_walls=has_walls).reshape(3, 2).T
+    open_share = 1.0 - closed.reshape(3, 2).T
     reach = CAMERA_M + np.array([BEHIND_M, BEHIND_M, 0.0]) * open_share
     seen = np.stack([seen_from.min(0), seen_from.max(0)])
     low, high = np.minimum(low, seen[0] - reach[0]), np.maximum(high, seen[1] + reach[1])

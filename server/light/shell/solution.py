@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
+from scipy.sparse import csc_matrix
 
 from server.light.arrivals import PendingArrivals, RayGroup, begin_arrivals, trace_arrivals
 from server.light.light_estimation import LightEstimate
@@ -94,16 +94,16 @@ class Solution:
     def look_up(self, engine: Engine, volume: Volume, positions: Floats) -> LookUp:
         """Begin to trace what `arriving` needs for each of `positions` [n, 3] (world)."""
         evenly = np.broadcast_to(look_up_directions(), (len(positions), DIRECTIONS, 3))
-        directions = np.concatenate([evenly, self.emitters.seen_from(positions)[0]], axis=1)
-        rays = RayGroup(positions - volume.origin_world, None, directions)
-        return LookUp(self, volume, positions, begin_arrivals(engine, volume, [rays]))
+        towards = self.emitters.seen_from(positions)[0]
+        rays = RayGroup(positions - volume.origin_world, None, np.concatenate([evenly, towards], axis=1))
+        return LookUp(self, volume, positions, towards, begin_arrivals(engine, volume, [rays]))
 
     def arriving(self, look_up: LookUp) -> list[PlaceLight]:
         """The light at each position of a look-up of this solution."""
         positions, arrivals = look_up.positions, look_up.rays.results()[0]
         met = self._met(positions, look_up_directions()[0], arrivals[:, :DIRECTIONS])
         visible = self.emitters.visible(look_up.volume, positions, arrivals[:, DIRECTIONS:])
-        rays = self._with_emitters(positions, met, visible)
+        rays = self._with_emitters(positions, look_up.towards, met, visible)
         return [self._arriving(position, of_place) for position, of_place in zip(positions, rays, strict=True)]
 
     def beyond(self, positions: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
@@ -177,8 +177,9 @@ class Solution:
         columns, shares = np.where(is_known, met.columns, NO_CELL), np.where(is_known, met.shares, 0.0)
         return replace(met, columns=columns, shares=shares)
 
-    def _with_emitters(self, positions: Floats, met: Met, visible: NDArray[np.bool_]) -> list[_Rays]:
-        """What evenly spread rays from `positions` [n, 3] met, and a ray to each emitter, `visible` [n, k] or not."""
+    def _with_emitters(self, positions: Floats, towards: Floats, met: Met, visible: NDArray[np.bool_]) -> list[_Rays]:
+        """What evenly spread rays from `positions` [n, 3] met, and rays `towards` [n, k, 3] the emitters, `visible`
+        [n, k] or not."""
         emitters = self.emitters
         solid_angles = emitters.solid_angles(positions)
         weights = emitters.weights(solid_angles / (4 * np.pi), DIRECTIONS)
@@ -189,11 +190,10 @@ class Solution:
         columns = columns_of(self.hidden, bright_keys(emitters.centers))
         columns = np.where(columns < self.near.known, columns, NO_CELL)
         brought = weights * solid_angles * visible * (columns >= 0)
-        towards = sh_basis(emitters.seen_from(positions)[0].reshape(-1, 3), BANDS)
-        towards = towards.reshape(*brought.shape, BANDS * BANDS)
+        basis = sh_basis(towards.reshape(-1, 3), BANDS).reshape(*brought.shape, BANDS * BANDS)
         return [
             _Rays(
-                np.concatenate([_basis(), towards[k].T * brought[k]], axis=1),
+                np.concatenate([_basis(), basis[k].T * brought[k]], axis=1),
                 np.concatenate([met.columns[k], np.repeat(columns[:, None], CORNERS, axis=1)]),
                 np.concatenate([shares[k], np.eye(1, CORNERS).repeat(len(columns), axis=0)]),
                 np.concatenate([met.known[k], np.zeros((len(columns), 3))]),
@@ -231,8 +231,8 @@ class Solution:
         cells = rays.columns[is_cell]
         sent = rays.shares[is_cell] * (self.near.radiance @ LUMINANCE)[cells]
         ends = np.concatenate([[0], np.cumsum(is_cell.sum(axis=1))])
-        by_ray = csr_matrix((sent, cells, ends), shape=(len(is_cell), self.near.known))
-        return np.asarray((by_ray.T @ rays.basis.T).T)
+        by_ray = csc_matrix((sent, cells, ends), shape=(self.near.known, len(is_cell)))
+        return np.asarray((by_ray @ rays.basis.T).T)
 
 
 @dataclass(frozen=True)
@@ -243,5 +243,7 @@ class LookUp:
     volume: Volume
     positions: Floats
     """[n, 3] world."""
+    towards: Floats
+    """[n, k, 3] unit, to the solution's emitters."""
     rays: PendingArrivals
     """Along look_up_directions, then towards the solution's emitters."""

@@ -9,7 +9,7 @@ from server.light.shell.bright_surface import EmittersSeen
 from server.light.shell.evidence import Evidence, evidence_of
 from server.light.shell.objective import Unknowns, received, step
 from server.light.shell.patches import GRIDS, Patches
-from server.light.shell.shell import Shell, closed_sides, shell_around
+from server.light.shell.shell import Shell, closed_sides, room_axes, shell_around
 from server.light.shell.solution import Solution
 from server.light.shell.sources import Sources, distant_sources, near_sources
 from server.light.shell.switches import Switches
@@ -78,11 +78,10 @@ class Solver:
         side_m, has_walls = patches.side_m, patches.has_walls
         if side_m != self._side_m:  # they were put together
             self._begin_anew(side_m)
-        self._shell = shell = shell_around(
-            positions, normals, camera[None], up, patches.area_m2, self._shell, has_walls=has_walls
-        )
+        axes = room_axes(normals, up, self._shell)
+        closed = closed_sides(positions, normals, axes, patches.area_m2, has_walls=has_walls)
+        self._shell = shell = shell_around(positions, camera[None], axes, closed, self._shell)
         self._transport.update(patches, bright, traced, shell)
-        closed = closed_sides(positions, normals, shell.axes, patches.area_m2, has_walls=has_walls)
         evidence = evidence_of(patches, rows, switches)
         near = near_sources(self._transport, shell, patches, evidence.rows)
         distant = distant_sources(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from server.light.light_estimation import LEAST_OPENNESS
 from server.light.shell import weights
+from server.light.shell.evidence import DARKEST, log_chroma
 from server.light.shell.patches import Patches
 from server.light.shell.shell import CELLS, SIDE, Shell, neighbours
 from server.light.shell.transport import Transport
@@ -60,6 +62,21 @@ class Sources:
     def count(self) -> int:
         """Number of sources."""
         return len(self.offset)
+
+    @cached_property
+    def known_logs(self) -> Floats:
+        """[n, 3] as of log_chroma, of what photographed surface brings."""
+        return log_chroma(np.log(np.maximum(self.known, DARKEST)))
+
+    @cached_property
+    def known_level(self) -> Floats:
+        """[n] exp of its mean logarithm over the channels; 0 where there is none."""
+        return np.where(self.known.max(axis=1) > 0, np.exp(self.known_logs[:, 0]), 0.0)
+
+    @cached_property
+    def says_nothing(self) -> NDArray[np.bool_]:
+        """[n] patches that receive no more than `least_share` of their light from all that is here."""
+        return np.asarray((self.known_level == 0) & (self.shares.sum(axis=1) <= self.least_share))
 
 
 def near_sources(transport: Transport, shell: Shell, patches: Patches, rows: Ints) -> Sources:

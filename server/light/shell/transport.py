@@ -153,7 +153,7 @@ class Transport:
         self.lit[columns] = emitters.lit_by(patches, shell.axes[2])
         shares = emitters.shares(patches.positions[rows], patches.normals[rows])
         weights = emitters.weights(shares, RAYS // 2)
-        sums = self._by_rays[rows].astype(np.float64)
+        sums = self._by_rays[rows]
         for column, brought in zip(columns, (weights * shares * bright.visible[rows]).T, strict=True):
             sums[:, column] += brought  # several may share the last one
         row = np.searchsorted(rows, self._bright_rows)
@@ -165,9 +165,9 @@ class Transport:
 
     def _add_cells(self, keys: Ints, *, is_saturated: bool) -> None:
         most = MOST_SATURATED if is_saturated else MOST_HIDDEN
-        for key in map(int, np.unique(keys)):
+        for key in sorted(set(keys.tolist()) - self.hidden.keys()):
             is_full = np.count_nonzero(self.is_saturated[CELLS : self.columns] == is_saturated) >= most
-            number = SHARED[is_saturated] if is_full and key not in self.hidden else key
+            number = SHARED[is_saturated] if is_full else key
             if number not in self.hidden:
                 self.is_saturated[self.columns] = is_saturated
                 self.hidden[number] = self.columns

@@ -16,6 +16,7 @@ from tests.bench.light.lamp_in_view import lamps_in_view_part
 from tests.bench.light.places import halves_part, kitchen_part
 from tests.bench.light.robustness import robustness_part
 from tests.bench.light.room import room_part
+from tests.bench.light.room_cost import room_cost_part
 from tests.bench.light.same_frames import same_frames_part
 from tests.bench.light.speed import speed_part
 from tests.bench.report.finished import Part
@@ -56,5 +57,6 @@ PARTS: dict[str, Callable[[Run], Part]] = {
     KITCHEN: kitchen_part,
     "kitchen, the same frames": same_frames_part,
     "speed": speed_part,
+    "what a room's light costs": room_cost_part,
     **{name: partial(elsewhere, name) for name in ELSEWHERE},
 }

@@ -118,12 +118,14 @@ class Offsets:
         of_surfaces *= root.astype(np.float32)
         matrix -= of_surfaces.T @ of_surfaces
         vector -= of_surfaces.T @ (root * self._sums(differences)[several]).astype(np.float32)
-        return matrix / np.float32(GRIDS), vector / np.float32(GRIDS)
+        matrix /= np.float32(GRIDS)
+        vector /= np.float32(GRIDS)
+        return matrix, vector
 
     def _less(self, values: Singles, sums: NDArray[Any], taken: Floats) -> Singles:
         """[n, c] the roots of the weights times: `values` [n, c] less the share `taken` of their regions' `sums`."""
         regions = self.regions
-        left = np.repeat((-taken[:, None] * sums).astype(np.float32), regions.sizes, axis=0)
+        left = np.repeat(-taken.astype(np.float32)[:, None] * sums.astype(np.float32), regions.sizes, axis=0)
         left += values
         left *= np.sqrt(regions.counts).astype(np.float32)[:, None]
         return left

@@ -131,7 +131,8 @@ class Unknowns:
     def keep(self, curvature: Singles) -> None:
         """The curvature of this step."""
         self.curvature = curvature
-        self.factor = cho_factor(self.curvature, check_finite=False)
+        # Transposed, it is the same and in LAPACK's order, which saves a copy.
+        self.factor = cho_factor(self.curvature.T, check_finite=False)
 
     def solve(self, right: Floats) -> Floats:
         """[k + albedos] the change to which the slope `right` leads by the curvature."""
@@ -257,7 +258,7 @@ def _design(shares: Singles, level: Singles, arriving: Floats, of_albedos: Float
     design = np.empty((len(shares), len(level) + of_albedos.shape[1]), np.float32)
     parts = design[:, : len(level)]
     np.multiply(shares, level, out=parts)
-    parts /= arriving.astype(np.float32)[:, None]
+    parts *= (1 / arriving).astype(np.float32)[:, None]
     design[:, len(level) :] = of_albedos
     return design
 

@@ -114,14 +114,16 @@ def distant_sources(transport: Transport, closed: Floats, up: Floats, rows: Ints
     count = transport.columns
     is_closed = closed.astype(np.float32)
     beyond = np.einsum("nfl,f->nl", transport.beyond[rows], 1 - is_closed)
-    near = transport.shares[rows, :count]
+    shares = np.empty((len(rows), LOBES + count), np.float32)
+    shares[:, :LOBES], near = beyond, shares[:, LOBES:]
+    near[:] = transport.shares[rows, :count]
     near[:, :CELLS] *= np.repeat(is_closed, SIDE * SIDE)
     known = transport.known[rows]
     if not with_indirect:
         near[:, CELLS:], known = 0.0, np.zeros_like(known)
     offset, deviation = _priors(transport)
     return Sources(
-        shares=np.concatenate([beyond, near], axis=1),
+        shares=shares,
         known=known,
         clipped=np.concatenate([np.zeros((LOBES, 3)), transport.clipped[:count]]),
         is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[:count]]),

@@ -46,10 +46,10 @@ OPTIONS_OF_OTHERS = {
     "--count",
     "--from",
     "--group-add",
+    "--large",
     "--python",
     "--seed",
     "--serve",
-    "--large",
     "--turn",
 }
 """Of other programs, that sentences name."""

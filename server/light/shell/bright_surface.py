@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from server.light.arrivals import RayGroup
 from server.light.shell.patches import GRIDS, MOST_PATCHES, MOST_WEIGHT, Patches
@@ -74,20 +75,19 @@ class Emitters:
         """Those of the numbers `chosen` [m]."""
         return Emitters(**{part.name: getattr(self, part.name)[chosen] for part in fields(self)})
 
-    def seen_from(self, points: Floats) -> tuple[Floats, Floats, Floats]:
-        """Unit directions [n, k, 3] from `points` [n, 3], distances [n, k] and areas across them [n, k]."""
-        distances, areas = self._apart(points)
-        return (self.centers[None] - points[:, None]) / distances[..., None], distances, areas
+    def directions_from(self, points: Floats) -> Floats:
+        """[n, k, 3] unit, from `points` [n, 3]."""
+        return np.asarray((self.centers[None] - points[:, None]) / self.seen_from(points)[0][..., None])
 
-    def _apart(self, points: Floats) -> tuple[Floats, Floats]:
-        """Distances [n, k] from `points` [n, 3] and areas across them [n, k]."""
-        distances = np.sqrt(np.maximum(_squared_distances(points, self.centers), 1e-12))
+    def seen_from(self, points: Floats) -> tuple[Floats, Floats]:
+        """Distances [n, k] from `points` [n, 3] and areas across the line of sight [n, k]."""
+        distances = np.maximum(cdist(points, self.centers), 1e-6)
         cosines = np.maximum(points @ self.facing.T - (self.centers * self.facing).sum(axis=1), 0.0) / distances
         return distances, self.areas_m2 * ((1 - self.flatness) + self.flatness * cosines)
 
     def shares(self, points: Floats, normals: Floats) -> Floats:
         """[n, k] that emitters fill of the cosine-weighted hemispheres of `points` with unit `normals`, [n, 3] each."""
-        distances, areas = self._apart(points)
+        distances, areas = self.seen_from(points)
         cosines = np.maximum(normals @ self.centers.T - (normals * points).sum(axis=1)[:, None], 0.0) / distances
         return np.asarray(cosines * areas / (np.pi * distances**2 + areas))
 
@@ -97,7 +97,7 @@ class Emitters:
         Flat surface that faces up is lit: a table, a floor. up: [3] unit, world.
         """
         rows = patches.used[patches.clipped[patches.used] < 0.5]
-        near = np.exp(-_squared_distances(self.centers, patches.positions[rows]) / (2 * NEARBY_M**2))
+        near = np.exp(-cdist(self.centers, patches.positions[rows], "sqeuclidean") / (2 * NEARBY_M**2))
         alike = np.maximum(self.facing @ patches.normals[rows].T, 0.0) ** 2 * near
         shown = np.exp(patches.logarithms[rows].mean(axis=1))
         dark_patches = GRIDS  # far from all patches, no light arrives
@@ -108,7 +108,7 @@ class Emitters:
 
     def solid_angles(self, points: Floats) -> Floats:
         """[n, k] steradians."""
-        distances, areas = self._apart(points)
+        distances, areas = self.seen_from(points)
         return np.asarray(areas / (distances**2 + areas / (2 * np.pi)))
 
     def weights(self, shares: Floats, rays: int) -> Floats:
@@ -128,7 +128,7 @@ class Emitters:
     def visible(self, volume: Volume, points: Floats, arrivals: NDArray[np.float32]) -> NDArray[np.bool_]:
         """[n, k] whether nothing stands between `points` [n, 3] and an emitter. arrivals: [n, k, 4] what rays towards
         the emitters met, as of trace_arrivals."""
-        distances, areas = self._apart(points)
+        distances, areas = self.seen_from(points)
         met = np.abs(arrivals[..., 3])
         own = np.sqrt(areas) + 2 * volume.voxel_m  # what is as near to its middle is the emitter itself
         return np.asarray((met == 0) | (met >= distances - own))
@@ -203,7 +203,7 @@ class BrightSurface:
         rows = np.array([*self._rows.values()])
         is_shown = np.array([key in shown for key in self._rows])
         centers = self._centers[rows] / np.maximum(self._squares[rows], 1e-12)[:, None]
-        apart = _squared_distances(centers, positions).min(axis=1, initial=np.inf)
+        apart = cdist(centers, positions, "sqeuclidean").min(axis=1, initial=np.inf)
         areas = self._squares[rows] / np.maximum(self._areas[rows], 1e-12)
         is_in_view = is_shown | (apart <= areas / np.pi)
         rows, is_shown = rows[is_in_view], is_shown[is_in_view]
@@ -285,7 +285,7 @@ class BrightSurface:
 def _begin(volume: Volume, patches: Patches, asked: Ints, emitters: Emitters, rows: Ints) -> TracedEmitters:
     """From the patches `asked` [n] towards `emitters`, of `rows`."""
     origins = patches.positions[asked] + volume.voxel_m * patches.normals[asked]
-    rays = RayGroup(origins - volume.origin_world, None, emitters.seen_from(origins)[0])
+    rays = RayGroup(origins - volume.origin_world, None, emitters.directions_from(origins))
     return TracedEmitters(emitters, rows, asked, origins, rays)
 
 
@@ -302,12 +302,6 @@ def _by_cell(bright: SeenBright, cells: Ints, count: int) -> SeenBright:
     flatness = _flatness(lengths)
     cosines = np.maximum(-(normal * line).sum(axis=1) / np.maximum(lengths, 1e-6), _LEAST_COSINE)
     return SeenBright(center, normal, radiance, across / (1 - flatness + flatness * cosines), bright.eye)
-
-
-def _squared_distances(points: Floats, others: Floats) -> Floats:
-    """[n, m] between points [n, 3] and [m, 3]: |p|^2 - 2 p q + |q|^2 takes one product of matrices."""
-    squares = (points**2).sum(axis=1)[:, None] - 2 * points @ others.T + (others**2).sum(axis=1)
-    return np.asarray(squares)
 
 
 def _keys(points: Floats) -> Ints:

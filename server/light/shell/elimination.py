@@ -125,7 +125,8 @@ class Offsets:
     def _less(self, values: Singles, sums: NDArray[Any], taken: Floats) -> Singles:
         """[n, c] the roots of the weights times: `values` [n, c] less the share `taken` of their regions' `sums`."""
         regions = self.regions
-        left = np.repeat(-taken.astype(np.float32)[:, None] * sums.astype(np.float32), regions.sizes, axis=0)
+        less = -taken.astype(np.float32)[:, None] * sums.astype(np.float32, copy=False)
+        left = np.repeat(less, regions.sizes, axis=0)
         left += values
         left *= np.sqrt(regions.counts).astype(np.float32)[:, None]
         return left

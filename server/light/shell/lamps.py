@@ -56,7 +56,7 @@ def emitting_lamps(position: Floats, emitters: Emitters, radiance: Floats, other
     """
     if not emitters.count:
         return []
-    _, _, areas = emitters.seen_from(position[None])
+    _, areas = emitters.seen_from(position[None])
     sent = emitters.solid_angles(position[None])[0] * emitters.presence * radiance.sum(axis=1)
     total = float(sent.sum()) + others
     lamps = []

@@ -94,7 +94,7 @@ class Solution:
     def look_up(self, engine: Engine, volume: Volume, positions: Floats) -> LookUp:
         """Begin to trace what `arriving` needs for each of `positions` [n, 3] (world)."""
         evenly = np.broadcast_to(look_up_directions(), (len(positions), DIRECTIONS, 3))
-        towards = self.emitters.seen_from(positions)[0]
+        towards = self.emitters.directions_from(positions)
         rays = RayGroup(positions - volume.origin_world, None, np.concatenate([evenly, towards], axis=1))
         return LookUp(self, volume, positions, towards, begin_arrivals(engine, volume, [rays]))
 
@@ -143,7 +143,7 @@ class Solution:
 
     def _whole(self, position: Floats, from_shell: Floats, bands: int) -> Floats:
         """[bands^2, 3] of the shell and the emitters. from_shell: [DIRECTIONS, 3]."""
-        towards = sh_basis(self.emitters.seen_from(position[None])[0][0], bands)
+        towards = sh_basis(self.emitters.directions_from(position[None])[0], bands)
         from_emitters = towards.T @ (self._emitting_angles(position)[:, None] * self._sent_by_emitters)
         return np.asarray(_basis(bands) @ from_shell + from_emitters)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from server.light.shell.bright_surface import Emitters
 from server.light.shell.distant import distant_light
 from server.light.shell.lamps import ShellLamp, emitting_lamps, find_lamps
 from server.light.shell.patches import Patches
-from server.light.shell.shell import CORNERS, SIDE, Shell
+from server.light.shell.shell import SIDE, Shell
 from server.light.shell.solved import Solved
 from server.light.shell.spread import deviations, spread_deg
 from server.light.shell.transport import KNOWN, NO_CELL, Met, bright_keys, columns_of, meet
@@ -44,18 +44,6 @@ def look_up_directions() -> Floats:
 def _basis(bands: int = BANDS) -> Floats:
     """[bands^2, DIRECTIONS] weights that project radiance on spherical harmonics."""
     return np.asarray(4 * np.pi / DIRECTIONS * sh_basis(look_up_directions()[0], bands).T)
-
-
-@dataclass(frozen=True)
-class _Rays:
-    """[m] rays from a place, and what they meet."""
-
-    basis: Floats
-    """[bands^2, m] weights that project their radiance on spherical harmonics."""
-    columns: NDArray[np.int64]
-    shares: Floats
-    known: Floats
-    """As in Met."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +91,19 @@ class Solution:
         positions, arrivals = look_up.positions, look_up.rays.results()[0]
         met = self._met(positions, look_up_directions()[0], arrivals[:, :DIRECTIONS])
         visible = self.emitters.visible(look_up.volume, positions, arrivals[:, DIRECTIONS:])
-        rays = self._with_emitters(positions, look_up.towards, met, visible)
-        return [self._arriving(position, of_place) for position, of_place in zip(positions, rays, strict=True)]
+        met, to_sh = self._with_emitters(positions, look_up.towards, met, visible)
+        columns, sent = self._sent_by_emitters
+        sh = _basis() @ self._radiance_of(met) + to_sh @ sent
+        luminance, tints = sh @ LUMINANCE, sh[:, 0] / np.maximum(sh[:, :1] @ LUMINANCE, 1e-12)
+        gradients = self._gradients(met)
+        for column, gradient in zip(columns, (to_sh * (sent @ LUMINANCE)).transpose(2, 0, 1), strict=True):
+            gradients[:, column] += gradient  # several emitters may share the last one
+        covariances = self.near.covariance_of(gradients.swapaxes(1, 2))
+        seen = (met.columns[..., 0] == KNOWN).mean(axis=1)
+        return [
+            _place_light(*of_place)
+            for of_place in zip(positions, sh, luminance, covariances, tints, seen.tolist(), strict=True)
+        ]
 
     def beyond(self, positions: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
         """The light from the shell as seen from `positions` [n, 3] (world), with no surface in between.
@@ -130,7 +129,7 @@ class Solution:
     def _seen_beyond(self, positions: Floats, bands: int) -> tuple[Floats, Floats, list[ShellLamp]]:
         middle = positions.mean(axis=0)
         ends, radiance, blur_m2 = self._sent_by_shell(middle)
-        sent = self._sent_by_emitters
+        _, sent = self._sent_by_emitters
         emitting = emitting_lamps(middle, self.emitters, sent, 4 * np.pi / DIRECTIONS * float(radiance.sum()))
         emitted = DIRECTIONS / (4 * np.pi) * float((self._emitting_angles(middle) @ sent).sum())
         lamps, parts = find_lamps(middle, ends, radiance, blur_m2, MOST_LIGHTS - len(emitting), emitted)
@@ -144,7 +143,7 @@ class Solution:
     def _whole(self, position: Floats, from_shell: Floats, bands: int) -> Floats:
         """[bands^2, 3] of the shell and the emitters. from_shell: [DIRECTIONS, 3]."""
         towards = sh_basis(self.emitters.directions_from(position[None])[0], bands)
-        from_emitters = towards.T @ (self._emitting_angles(position)[:, None] * self._sent_by_emitters)
+        from_emitters = towards.T @ (self._emitting_angles(position)[:, None] * self._sent_by_emitters[1])
         return np.asarray(_basis(bands) @ from_shell + from_emitters)
 
     def _sent_by_shell(self, position: Floats) -> tuple[Floats, Floats, Floats]:
@@ -161,25 +160,28 @@ class Solution:
         """[k] sr under which each emitter is seen from `position`."""
         return np.asarray(self.emitters.presence * self.emitters.solid_angles(position[None])[0])
 
-    @property
-    def _sent_by_emitters(self) -> Floats:
-        """[k, 3] radiance beyond what is photographed."""
+    @cached_property
+    def _sent_by_emitters(self) -> tuple[NDArray[np.int64], Floats]:
+        """[k] columns, and [k, 3] radiance beyond what is photographed, 0 where no patch has received light."""
         columns = columns_of(self.hidden, bright_keys(self.emitters.centers))
         is_known = (columns >= 0) & (columns < self.near.known)
-        return np.where(is_known[:, None], self.near.radiance[np.where(is_known, columns, 0)], 0.0)
+        columns = np.where(is_known, columns, 0)
+        return columns, np.where(is_known[:, None], self.near.radiance[columns], 0.0)
 
     def _met(self, positions: Floats, directions: Floats, arrivals: NDArray[np.float32]) -> Met:
         """What rays from `positions` [n, 3] along `directions` [m, 3] met; cells that the solution does not have are
         NO_CELL. arrivals: [n, m, 4] as of trace_arrivals."""
         turned = np.broadcast_to(directions, (len(positions), *directions.shape))
-        met = meet(self.shell, self.hidden, positions, turned, arrivals.astype(np.float64))
+        met = meet(self.shell, self.hidden, positions, turned, arrivals)
         is_known = met.columns < self.near.known
         columns, shares = np.where(is_known, met.columns, NO_CELL), np.where(is_known, met.shares, 0.0)
         return replace(met, columns=columns, shares=shares)
 
-    def _with_emitters(self, positions: Floats, towards: Floats, met: Met, visible: NDArray[np.bool_]) -> list[_Rays]:
-        """What evenly spread rays from `positions` [n, 3] met, and rays `towards` [n, k, 3] the emitters, `visible`
-        [n, k] or not."""
+    def _with_emitters(
+        self, positions: Floats, towards: Floats, met: Met, visible: NDArray[np.bool_]
+    ) -> tuple[Met, Floats]:
+        """What evenly spread rays from `positions` [n, 3] met, less what rays `towards` [n, k, 3] the emitters,
+        `visible` [n, k] or not, bring; and [n, bands^2, k] weights that project what emitters send on harmonics."""
         emitters = self.emitters
         solid_angles = emitters.solid_angles(positions)
         weights = emitters.weights(solid_angles / (4 * np.pi), DIRECTIONS)
@@ -187,52 +189,38 @@ class Solution:
         ends = positions[place] + met.distances[place, ray, None] * look_up_directions()[0, ray]
         shares = met.shares.copy()
         shares[place, ray] *= emitters.left_to_others(weights, place, ends)[:, None]
-        columns = columns_of(self.hidden, bright_keys(emitters.centers))
-        columns = np.where(columns < self.near.known, columns, NO_CELL)
-        brought = weights * solid_angles * visible * (columns >= 0)
-        basis = sh_basis(towards.reshape(-1, 3), BANDS).reshape(*brought.shape, BANDS * BANDS)
-        return [
-            _Rays(
-                np.concatenate([_basis(), basis[k].T * brought[k]], axis=1),
-                np.concatenate([met.columns[k], np.repeat(columns[:, None], CORNERS, axis=1)]),
-                np.concatenate([shares[k], np.eye(1, CORNERS).repeat(len(columns), axis=0)]),
-                np.concatenate([met.known[k], np.zeros((len(columns), 3))]),
-            )
-            for k in range(len(positions))
-        ]
+        basis = sh_basis(towards.reshape(-1, 3), BANDS).reshape(*towards.shape[:2], BANDS * BANDS)
+        brought = weights * solid_angles * visible
+        return replace(met, shares=shares), (basis * brought[..., None]).swapaxes(1, 2)
 
-    def _radiance_of(self, met: Met | _Rays) -> Floats:
+    def _radiance_of(self, met: Met) -> NDArray[np.floating]:
         """[..., 3]."""
-        cells = self.near.radiance[np.maximum(met.columns, 0)]
-        radiance = met.known + np.einsum("...c,...cr->...r", met.shares, cells)
-        is_new = (met.columns[..., 0] == NO_CELL) & (met.known.max(axis=-1) <= 0)
+        radiance = met.known.copy()
+        is_cell, is_new = met.columns[..., 0] >= 0, met.columns[..., 0] == NO_CELL
+        cells = self.near.radiance[met.columns[is_cell]]
+        radiance[is_cell] += np.einsum("nc,ncr->nr", met.shares[is_cell], cells)
         # Where it is new, no patch has received light from there.
-        return np.asarray(np.where(is_new[..., None], np.exp(self.near.mean), radiance))
+        radiance[is_new] = np.where(radiance[is_new].any(axis=-1)[:, None], radiance[is_new], np.exp(self.near.mean))
+        return radiance
 
-    def _arriving(self, position: Floats, rays: _Rays) -> PlaceLight:
-        radiance = self._radiance_of(rays)
-        sh = rays.basis @ radiance
-        luminance = radiance @ LUMINANCE
-        covariance = self.near.covariance_of(self._gradient(rays))
-        tint = radiance.mean(axis=0) / max(float(luminance.mean()), 1e-12)
-        angle = spread_deg(sh @ LUMINANCE, covariance)
-        return PlaceLight(
-            position=position,
-            sh=sh,
-            std=deviations(sh, covariance, tint),
-            spread_deg=angle,
-            valid=angle <= VALID_SPREAD_DEG,
-            seen=float((rays.columns[:DIRECTIONS, 0] == KNOWN).mean()),
-        )
+    def _gradients(self, met: Met) -> Floats:
+        """[n, known, bands^2] of coefficients of luminance by z, of evenly spread rays from n places."""
+        columns, shares = (np.moveaxis(part, 0, 1) for part in (met.columns, met.shares))  # by ray
+        ray, place, corner = np.nonzero(columns >= 0)
+        cells = columns[ray, place, corner]
+        sent = shares[ray, place, corner] * (self.near.radiance @ LUMINANCE)[cells]
+        starts, count = np.searchsorted(ray, np.arange(DIRECTIONS + 1)), len(met.columns)
+        shape = (count * self.near.known, DIRECTIONS)
+        by_ray = csc_matrix((sent, place * self.near.known + cells, starts), shape=shape)
+        return np.asarray(by_ray @ _basis().T).reshape(count, self.near.known, BANDS * BANDS)
 
-    def _gradient(self, rays: _Rays) -> Floats:
-        """[bands^2, known] of coefficients of luminance by z."""
-        is_cell = rays.columns >= 0
-        cells = rays.columns[is_cell]
-        sent = rays.shares[is_cell] * (self.near.radiance @ LUMINANCE)[cells]
-        ends = np.concatenate([[0], np.cumsum(is_cell.sum(axis=1))])
-        by_ray = csc_matrix((sent, cells, ends), shape=(self.near.known, len(is_cell)))
-        return np.asarray((by_ray @ rays.basis.T).T)
+
+def _place_light(
+    position: Floats, sh: Floats, luminance: Floats, covariance: Floats, tint: Floats, seen: float
+) -> PlaceLight:
+    angle = spread_deg(luminance, covariance)
+    std = deviations(sh, covariance, tint)
+    return PlaceLight(position, sh, std, angle, valid=angle <= VALID_SPREAD_DEG, seen=seen)
 
 
 @dataclass(frozen=True)

@@ -30,5 +30,6 @@ class Solved:
         return len(self.radiance)
 
     def covariance_of(self, gradient: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[m, m] covariance of what changes by `gradient` [m, n] with these logarithms."""
-        return np.asarray(gradient @ (self.covariance @ gradient.T.astype(np.float32)).astype(np.float64))
+        """[..., m, m] covariance of what changes by `gradient` [..., m, n] with these logarithms."""
+        turned = self.covariance @ gradient.swapaxes(-1, -2).astype(np.float32)
+        return np.asarray(gradient @ turned.astype(np.float64))

@@ -23,8 +23,8 @@ def deviations(sh: Floats, covariance: Floats, tint: Floats) -> Floats:
     about random axes that changes the coefficients of band l by their length times sqrt(l (l + 1)), all alike.
     """
     told = SPREAD_DOUBT * np.outer(np.sqrt(np.maximum(np.diag(covariance), 0.0)), tint)
-    bands = np.array([l for l in range(math.isqrt(len(sh))) for _ in range(2 * l + 1)])
-    lengths = np.sqrt(np.stack([np.bincount(bands, column**2) for column in sh.T], axis=1))[bands]
+    bands = np.repeat(np.arange(count := math.isqrt(len(sh))), 2 * np.arange(count) + 1)
+    lengths = np.sqrt(np.add.reduceat(sh**2, np.arange(count) ** 2))[bands]
     turn = np.radians(LEAST_SPREAD_DEG) / _QUANTILE_90
     turned = turn * np.sqrt(bands * (bands + 1) / (2 * bands + 1))[:, None] * lengths
     return np.asarray(np.hypot(told, turned))
@@ -36,7 +36,7 @@ def spread_deg(sh: Floats, covariance: Floats) -> float:
     length = float(np.linalg.norm(vector))
     if length < 1e-12:
         return 180.0
-    across = np.linalg.svd(np.eye(3) - np.outer(vector, vector) / length**2)[0][:, :2]
-    deviation = np.sqrt(max(float(np.trace(across.T @ spread @ across)) / 2, 0.0))
+    across = float(np.trace(spread) - vector @ spread @ vector / length**2)
+    deviation = np.sqrt(max(across / 2, 0.0))
     angle = np.degrees(np.arctan2(SPREAD_DOUBT * _QUANTILE_90 * deviation, length))
     return float(np.hypot(angle, LEAST_SPREAD_DEG))

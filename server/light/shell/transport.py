@@ -52,11 +52,11 @@ class Met:
     """[..., CORNERS] the unknown cells; all of them KNOWN or NO_CELL."""
     shares: Floats
     """[..., CORNERS] of them, with sum 1 or, where KNOWN, 0."""
-    known: Floats
+    known: NDArray[np.floating]
     """[..., 3] radiance of photographed surface, 0 elsewhere."""
     is_saturated: NDArray[np.bool_]
     """[...] whether that is a lower bound: the cell's is added to it."""
-    distances: Floats
+    distances: NDArray[np.floating]
     """[...] metres; 0 where no surface is met."""
 
 
@@ -216,23 +216,25 @@ def bright_keys(points: Floats) -> Ints:
     return np.asarray(2 * _cell_numbers(points, CELL_M) + 1)
 
 
-def meet(shell: Shell, hidden: Mapping[int, int], origins: Floats, directions: Floats, arrivals: Floats) -> Met:
+def meet(
+    shell: Shell, hidden: Mapping[int, int], origins: Floats, directions: Floats, arrivals: NDArray[np.floating]
+) -> Met:
     """What rays from `origins` [n, 3] (world) along `directions` [n, m, 3] meet; arrivals [n, m, 4] as traced.
 
     hidden: as of Transport.
     """
-    distance, radiance = arrivals[..., 3], arrivals[..., :3]
-    is_bright, is_back = _is_bright(arrivals), _is_back(arrivals)
+    distance, is_bright, is_back = arrivals[..., 3], _is_bright(arrivals), _is_back(arrivals)
     is_free = (distance <= 0) & ~is_back
     columns = np.full((*distance.shape, CORNERS), KNOWN, np.int64)
     shares = np.zeros((*distance.shape, CORNERS))
-    starts = np.broadcast_to(origins[:, None], directions.shape)
-    columns[is_free], shares[is_free] = shell.exits(starts[is_free], directions[is_free])
+    place, ray = np.nonzero(is_free)
+    columns[place, ray], shares[place, ray] = shell.exits(origins[place], directions[place, ray])
     for chosen, keys_of in ((is_back, _back_keys), (is_bright, bright_keys)):
-        ends = starts[chosen] + np.abs(distance[chosen])[:, None] * directions[chosen]
-        columns[chosen] = columns_of(hidden, keys_of(ends))[:, None]
-        shares[chosen, 0] = 1.0
-    known = np.where((distance > 0)[..., None], radiance, 0.0)
+        place, ray = np.nonzero(chosen)
+        ends = origins[place] + np.abs(distance[place, ray])[:, None] * directions[place, ray]
+        columns[place, ray] = columns_of(hidden, keys_of(ends))[:, None]
+        shares[place, ray, 0] = 1.0
+    known = arrivals[..., :3] * (distance > 0)[..., None]
     return Met(columns, shares, known, is_bright, np.abs(distance))
 
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from server.light.shell.bright_surface import CELL_M, MOST_EMITTERS, BrightSurface, Emitters, EmittersSeen
-from server.light.shell.objective import Unknowns, step
+from server.light.shell.bright_surface import MOST_EMITTERS, BrightSurface
+from server.light.shell.emitters import CELL_M, Emitters, EmittersSeen
+from server.light.shell.objective import step
 from server.light.shell.patches import MOST_PATCHES, PATCH_M, Patches
 from server.light.shell.picture import Seen, SeenBright
 from server.light.shell.sources import near_sources
 from server.light.shell.transport import bright_keys, columns_of
+from server.light.shell.unknowns import Unknowns
 from server.maths.sh import spherical_fibonacci
 from tests.scenes.analytic import Floats
 from tests.scenes.shell_room import UP, make_room
@@ -167,6 +169,7 @@ def test_a_bulb_in_view_is_solved(excess: float) -> None:
         np.array([np.pi * radius_m**2]),
         np.ones((1, 3)),
         np.ones(1),
+        np.zeros(1, bool),
     )
     bright = EmittersSeen(emitters, np.ones((MOST_PATCHES, 1)))
     room.transport.update(room.patches, bright, rows, room.shell)

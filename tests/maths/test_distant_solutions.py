@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 
 from server.light.shell import weights
-from server.light.shell.objective import Unknowns, received, step
+from server.light.shell.objective import received, step
 from server.light.shell.patches import PATCH_M
 from server.light.shell.solution import Solution
 from server.light.shell.solver import Solver
 from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
 from server.light.shell.transport import NEAR_SIDES, Transport
+from server.light.shell.unknowns import Unknowns
 from server.maths.light_direction import direction_error_deg
 from tests.scenes.analytic import Floats
-from tests.scenes.shell_room import CAMERA, NO_EMITTERS, OPEN, SIZE_M, UP, ShellRoom, make_room, sky
+from tests.scenes.shell_room import AWAY, NO_EMITTERS, OPEN, SIZE_M, UP, ShellRoom, make_room, sky
 
 
 def solved(solver: Solver, room: ShellRoom) -> Solution:
-    solution = solver.solve(room.patches, NO_EMITTERS, room.patches.used, CAMERA, UP)
+    solution = solver.solve(room.patches, NO_EMITTERS, room.patches.used, AWAY, UP)
     assert solution is not None
     return solution
 

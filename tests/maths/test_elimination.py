@@ -41,3 +41,22 @@ def test_normal_equations_are_those_of_all_observations_at_once(used: int) -> No
     precision = np.linalg.inv(np.diag(1 / counts) + OF_REGION * alike[0] + OF_SURFACE * alike[1])
     np.testing.assert_allclose(matrix, design.T @ precision @ design / GRIDS, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(vector, design.T @ precision @ residuals / GRIDS, rtol=1e-4, atol=1e-4)
+
+
+def test_further_columns_add_to_them_what_all_columns_together_have() -> None:
+    random = np.random.default_rng(5)
+    evidence = observed(random)
+    n, counts = len(evidence.rows), random.uniform(1, 20, len(evidence.rows))
+    design = random.uniform(0, 1, (n, COLUMNS + 4)).astype(np.float32)
+    residuals = random.normal(size=n)
+    surfaces = np.full(evidence.surfaces[-1] + 1, OF_SURFACE)
+
+    def offsets(columns: np.ndarray) -> Offsets:
+        return Offsets.of(Regions.of(columns, counts, evidence), OF_REGION, surfaces, np.zeros(len(surfaces)))
+
+    matrix, vector = offsets(design).normal_equations(design, residuals[:, None])
+    few = design[:, :COLUMNS]
+    across, own, slope = offsets(few).beside(few, design[:, COLUMNS:], residuals)
+    np.testing.assert_allclose(across, matrix[:COLUMNS, COLUMNS:], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(own, matrix[COLUMNS:, COLUMNS:], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(slope, vector[COLUMNS:, 0], rtol=1e-4, atol=1e-4)

@@ -12,13 +12,14 @@ from server.light.shell.fade import MOST_CHANGE, Fade, Told
 from server.light.shell.shell import CELLS, SIDE, Shell
 from server.light.shell.solution import Solution
 from server.light.shell.solved import Solved
+from server.light.shell.transport import lamp_keys
 from server.maths.sh import LUMINANCE
 from tests.scenes.analytic import Floats
 
 ROOM = Shell(np.eye(3), np.zeros(3), np.array([4.0, 3.6, 2.4]), 0.0, np.zeros((2, 3)))
 PLACE = np.array([1.7, 1.9, 0.6])
 CEILING = 5 * SIDE * SIDE
-HIDDEN = {77: CELLS, 99: CELLS + 1}
+HIDDEN = {75: CELLS, 99: CELLS + 1}
 """Keys of two pieces of hidden surface, and their columns."""
 
 
@@ -79,7 +80,7 @@ def test_young_light_follows_faster(new: float) -> None:
 
 def test_hidden_surface_is_told_by_what_it_is() -> None:
     """And not by its column, which another one may have."""
-    before, goal = solved(24), solved(26, hidden={99: CELLS, 55: CELLS + 1})
+    before, goal = solved(24), solved(26, hidden={99: CELLS, 54: CELLS + 1})
     before.near.radiance[CELLS:] = [[5.0] * 3, [9.0] * 3]
     told = next_told(before, goal)
     share = MOST_CHANGE / change(before, goal)
@@ -111,3 +112,14 @@ def test_what_is_asked_of_it_is_of_what_it_tells() -> None:
     told = next_told(solved(24), goal)
     whole, _, _ = told.beyond(PLACE[None], 4)
     np.testing.assert_allclose(whole[0] @ LUMINANCE, light_of(told))
+
+
+def test_a_lamp_that_no_picture_has_shown_comes_on_with_the_rest() -> None:
+    """Not at once, beside the light of the shell that it takes the place of."""
+    lamp = int(lamp_keys([0])[0])
+    before, goal = solved(24), solved(26, hidden={**HIDDEN, lamp: CELLS + len(HIDDEN)})
+    told = next_told(before, goal).near.radiance
+    first, last = before.near.radiance[CEILING + 26, 0], goal.near.radiance[CEILING + 26, 0]
+    share = (told[CEILING + 26, 0] - first) / (last - first)
+    assert 0 < share < 0.5
+    np.testing.assert_allclose(told[-1], share * goal.near.radiance[-1])

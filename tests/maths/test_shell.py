@@ -9,7 +9,7 @@ from server.light.shell import weights
 from server.light.shell.distant import distant_light
 from server.light.shell.evidence import DARKEST, log_chroma, materials_of
 from server.light.shell.level import LOGIT
-from server.light.shell.objective import Unknowns, received, step
+from server.light.shell.objective import received, step
 from server.light.shell.patches import PATCH_M, RAYS, Patches, hemisphere_weights, ray_directions
 from server.light.shell.shell import (
     BEHIND_M,
@@ -25,7 +25,8 @@ from server.light.shell.shell import (
 from server.light.shell.solver import LEAST_PATCHES
 from server.light.shell.sources import distant_sources
 from server.light.shell.switches import Switches
-from server.light.shell.transport import COLUMNS, MOST_HIDDEN, MOST_SATURATED, SATURATED, Transport, meet
+from server.light.shell.transport import COLUMNS, MOST_HIDDEN, MOST_LAMPS, MOST_SATURATED, SATURATED, Transport, meet
+from server.light.shell.unknowns import Unknowns
 from server.maths.lobes import LOBES, lobes_along, lobes_to_sh
 from server.maths.sh import LUMINANCE, sh_basis, spherical_fibonacci
 from tests.reference.room_objective import level_objective, middle_objective
@@ -379,7 +380,7 @@ def test_cells_beyond_the_most_share_one_of_their_kind() -> None:
     away = np.linspace(5.0, 40.0, RAYS)
     patches.arrivals[0] = np.stack([*np.tile(kinds, (3, 1)), np.where(kinds, away, -away)], axis=1)
     transport.update(patches, NO_EMITTERS, np.array([0]), shell)
-    assert transport.columns == COLUMNS
+    assert transport.columns == COLUMNS - MOST_LAMPS
     arrivals = patches.arrivals[:1].astype(np.float64)
     met = meet(shell, transport.hidden, np.zeros((1, 3)), ray_directions()[None], arrivals)
     columns, above = met.columns[0, :, 0], ray_directions()[:, 2] > 0

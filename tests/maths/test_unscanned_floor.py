@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from server.light.shell.evidence import evidence_of
-from server.light.shell.objective import Unknowns, step
+from server.light.shell.objective import step
 from server.light.shell.shell import CELLS, FLOOR, SIDE, Shell
 from server.light.shell.sources import near_sources
 from server.light.shell.switches import Switches
 from server.light.shell.transport import floor_shares
+from server.light.shell.unknowns import Unknowns
 from tests.scenes.analytic import Floats
 from tests.scenes.half_floor import floor_radiance, half_floor_room
 from tests.scenes.shell_room import SIZE_M

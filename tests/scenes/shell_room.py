@@ -10,19 +10,23 @@ import numpy as np
 
 from server.light.shell.bright_surface import BrightSurface
 from server.light.shell.evidence import Evidence, evidence_of
-from server.light.shell.objective import Unknowns, step
+from server.light.shell.objective import step
 from server.light.shell.patches import RAYS, Patches, hemisphere_weights, ray_directions
 from server.light.shell.picture import Seen
 from server.light.shell.shell import Shell, closed_sides
 from server.light.shell.sources import Sources, distant_sources, near_sources
 from server.light.shell.switches import Switches
 from server.light.shell.transport import Transport
+from server.light.shell.unknowns import Unknowns
+from server.light.shell.view import View
 from tests.scenes.analytic import Floats
 from tests.scenes.shells import shell_of
 
 SIZE_M = np.array([4.0, 3.6, 2.4])
 CAMERA = np.array([3.0, 2.6, 1.5])
 UP = np.array([0.0, 0.0, 1.0])
+AWAY = View(CAMERA, np.eye(3), (0.0, 0.0), (0.0, 0.0))
+"""A camera there that has nothing in its frame."""
 SPACING_M = 0.2
 KNOWN = np.array([0.22, 0.2, 0.18])
 """Radiance that the scanned surfaces send."""

@@ -8,21 +8,19 @@ pictures show of it is averaged over frames, so that it moves with the evidence.
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from server.light.arrivals import RayGroup
-from server.light.shell.patches import GRIDS, MOST_PATCHES, MOST_WEIGHT, Patches
+from server.light.shell.emitters import Emitters, EmittersSeen, keys_of
+from server.light.shell.patches import MOST_PATCHES, MOST_WEIGHT, Patches
 from server.light.shell.picture import SeenBright
-from server.light.shell.weights import GIVEN_ALBEDO
 from server.maths.distinct_rows import distinct_rows
 from server.volume.volume import Volume
 
-CELL_M = 0.3
-"""Side of the grid's cells: half a window pane. From a metre away its light comes from one direction."""
 MOST_EMITTERS = 64
 """Only the largest emitters of a room are kept; evenly spread rays meet the others by chance."""
 PRESENCE = 10.0
@@ -30,117 +28,14 @@ PRESENCE = 10.0
 LEAST_PRESENCE, MOST_PRESENCE = 0.25, 0.75
 """Share of the frames that show a cell clipped: up to the first value it is no emitter, from the second on it is
 one."""
-ENOUGH_RAYS = 4.0
-"""Number of evenly spread rays that meet an emitter from which on their count is better than one ray to its middle."""
 ROUND, FLAT = 2 / 3, 0.9
 """Length of the mean normal of half a sphere, as a picture shows it, and of a plane with a scan's noise."""
 MOVED_M = 0.05
 """An emitter that moved by more than this, the size of a bulb, has its visibility traced again."""
-NEARBY_M = 0.25
-"""Surface within this distance (standard deviation) is taken to receive the same light."""
-UNLIT, LIT = 0.25, 0.5
-"""Ratio of the light that arrives nearby to the light that a saturated surface sends. Below the first value the surface
-is a lamp; above the second, it may be bright paint in that light."""
 _LEAST_COSINE = 0.2
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Emitters:
-    """Cells of saturated surface at one frame. [k] emitters, world axes and metres."""
-
-    keys: NDArray[np.int64]
-    """[k, 3] of the grid."""
-    centers: Floats
-    """[k, 3]."""
-    facing: Floats
-    """[k, 3] unit."""
-    flatness: Floats
-    """[k] from 0, sends evenly in all directions, to 1, a plane that sends to its front as its cosine."""
-    areas_m2: Floats
-    """[k] as seen from the front."""
-    radiance: Floats
-    """[k, 3] as clipped."""
-    presence: Floats
-    """[k] from 0 to 1: how far it counts."""
-
-    @property
-    def count(self) -> int:
-        """Number of emitters."""
-        return len(self.areas_m2)
-
-    def only(self, chosen: Ints) -> Emitters:
-        """Those of the numbers `chosen` [m]."""
-        return Emitters(**{part.name: getattr(self, part.name)[chosen] for part in fields(self)})
-
-    def directions_from(self, points: Floats) -> Floats:
-        """[n, k, 3] unit, from `points` [n, 3]."""
-        return np.asarray((self.centers[None] - points[:, None]) / self.seen_from(points)[0][..., None])
-
-    def seen_from(self, points: Floats) -> tuple[Floats, Floats]:
-        """Distances [n, k] from `points` [n, 3] and areas across the line of sight [n, k]."""
-        distances = np.maximum(cdist(points, self.centers), 1e-6)
-        cosines = np.maximum(points @ self.facing.T - (self.centers * self.facing).sum(axis=1), 0.0) / distances
-        return distances, self.areas_m2 * ((1 - self.flatness) + self.flatness * cosines)
-
-    def shares(self, points: Floats, normals: Floats) -> Floats:
-        """[n, k] that emitters fill of the cosine-weighted hemispheres of `points` with unit `normals`, [n, 3] each."""
-        distances, areas = self.seen_from(points)
-        cosines = np.maximum(normals @ self.centers.T - (normals * points).sum(axis=1)[:, None], 0.0) / distances
-        return np.asarray(cosines * areas / (np.pi * distances**2 + areas))
-
-    def lit_by(self, patches: Patches, up: Floats) -> Floats:
-        """[k] from 0 to 1: how far the light on surface nearby that faces alike explains what each sends.
-
-        Flat surface that faces up is lit: a table, a floor. up: [3] unit, world.
-        """
-        rows = patches.used[patches.clipped[patches.used] < 0.5]
-        near = np.exp(-cdist(self.centers, patches.positions[rows], "sqeuclidean") / (2 * NEARBY_M**2))
-        alike = np.maximum(self.facing @ patches.normals[rows].T, 0.0) ** 2 * near
-        shown = np.exp(patches.logarithms[rows].mean(axis=1))
-        dark_patches = GRIDS  # far from all patches, no light arrives
-        arriving = alike @ shown / (alike.sum(axis=1) + dark_patches) / GIVEN_ALBEDO
-        share = arriving / np.maximum(self.radiance.mean(axis=1), 1e-6)
-        lit = np.clip((share - UNLIT) / (LIT - UNLIT), 0.0, 1.0)
-        return np.asarray(self.flatness * np.maximum(lit, np.clip(2 * self.facing @ up - 1, 0.0, 1.0)))
-
-    def solid_angles(self, points: Floats) -> Floats:
-        """[n, k] steradians."""
-        distances, areas = self.seen_from(points)
-        return np.asarray(areas / (distances**2 + areas / (2 * np.pi)))
-
-    def weights(self, shares: Floats, rays: int) -> Floats:
-        """[n, k] how far a ray to each emitter counts, not evenly spread `rays`, of which `shares` [n, k] meet it."""
-        return np.asarray(self.presence / (1 + shares * rays / ENOUGH_RAYS))
-
-    def left_to_others(self, weights: Floats, rows: Ints, ends: Floats) -> Floats:
-        """[m] how far rays count that meet saturated surface at `ends` [m, 3]; weights: [n, k], and whose row of it."""
-        numbers = {tuple(key): number for number, key in enumerate(self.keys.tolist())}
-        found, inverse = distinct_rows(_keys(ends))
-        number = np.array([numbers.get(tuple(key), -1) for key in found.tolist()], np.int64)[inverse]
-        result = np.ones(len(ends))
-        own = number >= 0
-        result[own] -= weights[rows[own], number[own]]
-        return result
-
-    def visible(self, volume: Volume, points: Floats, arrivals: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """[n, k] whether nothing stands between `points` [n, 3] and an emitter. arrivals: [n, k, 4] what rays towards
-        the emitters met, as of trace_arrivals."""
-        distances, areas = self.seen_from(points)
-        met = np.abs(arrivals[..., 3])
-        own = np.sqrt(areas) + 2 * volume.voxel_m  # what is as near to its middle is the emitter itself
-        return np.asarray((met == 0) | (met >= distances - own))
-
-
-@dataclass(frozen=True)
-class EmittersSeen:
-    """Emitters and which patches see them."""
-
-    emitters: Emitters
-    visible: Floats
-    """[MOST_PATCHES, k] 1 or 0."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +76,7 @@ class BrightSurface:
 
     def add(self, bright: SeenBright, positions: Floats) -> None:
         """Fold a picture in; positions: [m, 3] of all surface that it shows, clipped or not."""
-        found, cells = distinct_rows(_keys(bright.positions))
+        found, cells = distinct_rows(keys_of(bright.positions))
         keys = [tuple(key) for key in found.tolist()]
         self._note_presence(positions, set(keys))
         if not keys:
@@ -248,6 +143,7 @@ class BrightSurface:
             areas_m2=self._squares[rows] / self._areas[rows],
             radiance=self._radiance[rows] / weights,
             presence=presence[rows],
+            is_unseen=np.zeros(len(rows), bool),
         )
         return found, rows
 
@@ -302,11 +198,6 @@ def _by_cell(bright: SeenBright, cells: Ints, count: int) -> SeenBright:
     flatness = _flatness(lengths)
     cosines = np.maximum(-(normal * line).sum(axis=1) / np.maximum(lengths, 1e-6), _LEAST_COSINE)
     return SeenBright(center, normal, radiance, across / (1 - flatness + flatness * cosines), bright.eye)
-
-
-def _keys(points: Floats) -> Ints:
-    """[n, 3] cells of points [n, 3]."""
-    return np.asarray(np.floor(points / CELL_M).astype(np.int64))
 
 
 def _flatness(lengths: Floats | float) -> Floats:

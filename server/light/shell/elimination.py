@@ -62,7 +62,7 @@ class Regions:
             self.surfaces,
         )
 
-    def sums_of(self, values: Floats) -> Floats:
+    def sums_of(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
         """[regions, ...] weighted sums of values [n, ...]."""
         return np.asarray(self.members @ values)
 
@@ -104,32 +104,41 @@ class Offsets:
         matrix[np.ix_(used, used)], vector[used] = self._equations(design[:, used], sums[:, used], residuals)
         return matrix, vector
 
+    def beside(self, design: Singles, columns: Singles, residuals: Floats) -> tuple[Singles, Singles, Singles]:
+        """What `columns` [n, m] add to the normal equations of `design` [n, c], without the offsets: [c, m] beside the
+        matrix, [m, m] and [m] below it and the vector. residuals: [n] from which `center` was taken."""
+        of_design, of_columns = self._left(design, self.regions.sums), self._of(columns)
+        of_residuals = self._of(residuals[:, None].astype(np.float32))
+        across, own, vector = (_product(one, of_columns) for one in (of_design, of_columns, of_residuals))
+        return across, own, vector[0]
+
     def _equations(self, design: Singles, sums: Singles, residuals: Floats) -> tuple[Singles, Singles]:
         """As of normal_equations. sums: [regions, c] those of `design`."""
-        regions, several = self.regions, self._has_several
-        keeps, alone = self.keeps, ~several[self.regions.surfaces]
-        factor = self.of_region * keeps + np.where(alone, self.factor[regions.surfaces] * keeps**2, 0.0)
-        taken = factor / (1 + np.sqrt(1 - regions.totals * factor))  # the a whose 2 a - a^2 W is `factor`
-        differences = regions.sums_of(residuals)
-        left = self._less(design, sums, taken)
-        matrix = left.T @ left
-        vector = left.T @ self._less(residuals.astype(np.float32), differences, taken)
-        root, of_surfaces = np.sqrt(self.factor[several])[:, None], self._sums(sums)[several]
-        of_surfaces *= root.astype(np.float32)
-        matrix -= of_surfaces.T @ of_surfaces
-        vector -= of_surfaces.T @ (root * self._sums(differences)[several]).astype(np.float32)
-        matrix /= np.float32(GRIDS)
-        vector /= np.float32(GRIDS)
-        return matrix, vector
+        of_design = self._left(design, sums)
+        return _product(of_design, of_design), _product(of_design, self._of(residuals.astype(np.float32)))
 
-    def _less(self, values: Singles, sums: NDArray[Any], taken: Floats) -> Singles:
-        """[n, c] the roots of the weights times: `values` [n, c] less the share `taken` of their regions' `sums`."""
-        regions = self.regions
-        less = -taken.astype(np.float32)[:, None] * sums.astype(np.float32, copy=False)
-        left = np.repeat(less, regions.sizes, axis=0)
+    def _of(self, values: Singles) -> tuple[Singles, Singles]:
+        return self._left(values, self.regions.sums_of(values))
+
+    def _left(self, values: Singles, sums: NDArray[Any]) -> tuple[Singles, Singles]:
+        """[n, c] and [surfaces of several regions, c]: products of the first, less those of the second, are sums over
+        patches without the offsets. sums: [regions, c] weighted ones of `values` [n, c]."""
+        regions, several = self.regions, self._has_several
+        left = np.repeat(-self._taken[:, None] * sums.astype(np.float32, copy=False), regions.sizes, axis=0)
         left += values
         left *= np.sqrt(regions.counts).astype(np.float32)[:, None]
-        return left
+        of_surfaces = self._sums(sums)[several].astype(np.float32, copy=False)
+        of_surfaces *= np.sqrt(self.factor[several]).astype(np.float32)[:, None]
+        return left, of_surfaces
+
+    @cached_property
+    def _taken(self) -> Singles:
+        """[regions] share of a region's sums that is taken from each of its patches: the a whose 2 a - a^2 W is what
+        offsets explain, the region's own and, of a surface with no other, the surface's too."""
+        regions, keeps = self.regions, self.keeps
+        alone = ~self._has_several[regions.surfaces]
+        factor = self.of_region * keeps + np.where(alone, self.factor[regions.surfaces] * keeps**2, 0.0)
+        return np.asarray(factor / (1 + np.sqrt(1 - regions.totals * factor)), np.float32)
 
     def of_surfaces(self, residuals: Floats) -> Floats:
         """[surfaces, ...] the best offsets of surfaces, for residuals [n, ...] from which `center` was taken."""
@@ -158,6 +167,14 @@ def add_smoothness(matrix: Singles, pairs: Ints, strength: Floats | float) -> No
     matrix[np.diag_indices_from(matrix)] += np.bincount(pairs.ravel(), np.repeat(strength, 2), len(matrix))
     for first, second in (pairs.T, pairs.T[::-1]):
         matrix[first, second] -= strength
+
+
+def _product(one: tuple[Singles, Singles], other: tuple[Singles, Singles]) -> Singles:
+    """[c, m] of two of Offsets._left, with c and m columns."""
+    result = one[0].T @ other[0]
+    result -= one[1].T @ other[1]
+    result /= np.float32(GRIDS)
+    return np.asarray(result)
 
 
 def _members(shares: Floats, starts: Ints) -> csr_matrix:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from server.light.shell.shell import CELLS, Shell
 from server.light.shell.solution import Solution
+from server.light.shell.transport import LAMP
 from server.maths.sh import LUMINANCE
 
 MOST_CHANGE = 0.03
@@ -69,13 +70,15 @@ def _with_radiance(solution: Solution, radiance: Floats) -> Solution:
 
 def _carried(before: Told, solution: Solution, place: Floats) -> Floats:
     """[k, 3] what was told of the sources of `solution`; where the shell has moved, in the same directions from
-    `place`; of those that are new, what is solved."""
+    `place`; of those that are new, what is solved, and nothing of lamps that no picture has shown."""
     radiance = solution.near.radiance.copy()
     radiance[:CELLS] = _turned(before, solution.shell, place)
     for key, column in solution.hidden.items():
         earlier = before.hidden.get(key, len(before.radiance))
         if column < len(radiance) and earlier < len(before.radiance):
             radiance[column] = before.radiance[earlier]
+        elif column < len(radiance) and key % 3 == LAMP:
+            radiance[column] = 0.0
     return radiance
 
 

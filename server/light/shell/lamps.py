@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from server.light.shell.bright_surface import CELL_M, Emitters
+from server.light.shell.emitters import CELL_M, Emitters
 from server.maths.direct_lights import DirectLight, lamp_at
 from server.maths.dominant import MOST_LIGHTS
 

@@ -37,121 +37,33 @@ counts 1 / (1 + (e_p / LUMINOUS)^4) for positive e_p.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve
 
 from server.light.shell import weights
 from server.light.shell.chroma import solve_chroma
 from server.light.shell.elimination import Offsets, Regions, add_smoothness
-from server.light.shell.evidence import DARKEST, LOG_CHROMA, NODES, Evidence, materials_of
-from server.light.shell.level import LOGIT, Paint, brightest, level_step, logistic
-from server.light.shell.patches import GRIDS, MOST_PATCHES
+from server.light.shell.evidence import DARKEST, LOG_CHROMA, Evidence, materials_of
+from server.light.shell.level import Paint, brightest, level_step, logistic
+from server.light.shell.patches import GRIDS
 from server.light.shell.shell import CELLS, FLOOR
-from server.light.shell.solved import Solved
 from server.light.shell.sources import Sources
 from server.light.shell.switches import Switches
+from server.light.shell.unknowns import ALL_NODES, Unknowns, given_logit
 
-LEAST_RELAXATION = 0.05
-"""Least share of a Gauss-Newton step that is taken. It falls while steps turn back, and rises again, by TURNING_BACK
-and GOING_ON: the albedo that makes a surface white and the chroma that tells its material follow the light, and are
-not in the step's derivatives."""
-TURNING_BACK, GOING_ON = 0.7, 1.1
 MOST_STEP = 3.0
 """Greatest change of an unknown logarithm in a whole step."""
 BEGIN_EXCESS = np.arange(9.0)
 """Logarithms of excess, over its prior mean, of which new saturated sources begin at the best. A bulb is e^5 times as
 bright as a picture shows it."""
-ALL_NODES = np.arange(NODES * NODES)
 _FROM_CHROMA = np.linalg.inv(LOG_CHROMA)
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Ints = NDArray[np.int64]
-
-
-def _empty() -> Floats:
-    return np.zeros(0)
-
-
-@dataclass
-class Unknowns:
-    """What the objective is minimised over, and its curvature at the last step."""
-
-    z: Floats = field(default_factory=_empty)
-    """[k] log radiance of sources; of saturated ones, of their relative excess."""
-    chroma: Floats = field(default_factory=lambda: np.zeros((0, 2)))
-    """[k, 2]."""
-    materials: Floats = field(default_factory=lambda: np.full(len(ALL_NODES), LOGIT))
-    """[nodes] logit of albedo."""
-    offsets: Floats = field(default_factory=lambda: np.zeros(MOST_PATCHES))
-    """[MOST_PATCHES] o of the surface that each patch is part of."""
-    middle: float = LOGIT
-    """m, about which the materials lie."""
-    mean: float = 0.0
-    """Log of the mean radiance about which sources lie: of what pictures show, or of the light where the mean albedo is
-    given."""
-    radiance: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    """[k, 3] RGB of the sources."""
-    curvature: Singles = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    """[k + albedos] squared: half the second derivative of the objective at the last step, sources first."""
-    factor: tuple[Singles, bool] = field(default_factory=lambda: (np.zeros((0, 0), np.float32), False))
-    """Of the curvature (Cholesky), and whether it is the lower triangle."""
-    step: float = float("inf")
-    """By how much the last step changed the logarithm of what patches receive, root mean square."""
-
-    most_relaxation: float = 1.0
-    """Greatest share of a step to take."""
-    relaxation: float = 1.0
-    """Share of the last step that was taken, of those that are at most `most_relaxation`."""
-    last: Floats = field(default_factory=_empty)
-    """[k] the last whole step of z."""
-
-    @property
-    def known(self) -> int:
-        """Sources that have been solved for."""
-        return len(self.z)
-
-    def relax(self, change: Floats) -> float:
-        """The share of the step `change` [k] of z to take."""
-        turns_back = float(change[: len(self.last)] @ self.last) < 0
-        factor = TURNING_BACK if turns_back else GOING_ON
-        self.relaxation = float(np.clip(self.relaxation * factor, LEAST_RELAXATION, self.most_relaxation))
-        self.last = change.copy()
-        return self.relaxation
-
-    def forget(self, share: float, sources: Sources, switches: Switches) -> None:
-        """Go that share of the way back to the prior. Steps after it are whole ones again, as far as they may be."""
-        self.z += share * (_prior(self, sources)[: self.known] - self.z)
-        self.materials += share * (_given_logit(has_materials=switches.albedos) - self.materials)
-        self.relaxation, self.last = self.most_relaxation, _empty()
-
-    def keep(self, curvature: Singles) -> None:
-        """The curvature of this step."""
-        self.curvature = curvature
-        # Transposed, it is the same and in LAPACK's order, which saves a copy.
-        self.factor = cho_factor(self.curvature.T, check_finite=False)
-
-    def solve(self, right: Floats) -> Floats:
-        """[k + albedos] the change to which the slope `right` leads by the curvature."""
-        return cho_solve(self.factor, right.astype(np.float32), check_finite=False).astype(np.float64)  # type: ignore[no-any-return]
-
-    def solved(self, count: int | None = None) -> Solved:
-        """What it tells of all sources, with the covariance of the first `count`; None: of all."""
-        if self.known == 0:
-            return Solved(np.zeros((0, 3)), np.zeros((0, 0), np.float32), float("inf"), self.mean, self.step)
-        count = self.known if count is None else count
-        right = np.eye(len(self.curvature), count, dtype=np.float32)
-        inverse = cho_solve(self.factor, right, check_finite=False)
-        condition = _norm(self.curvature) * _norm(inverse)  # LAPACK's estimate has other last bits in each run
-        return Solved(self.radiance, inverse[:count], condition, self.mean, self.step)
-
-
-def _norm(matrix: Singles) -> float:
-    """The 1-norm."""
-    return float(np.abs(matrix).sum(axis=0).max())
 
 
 def step(
@@ -161,8 +73,10 @@ def step(
     switches: Switches | None = None,
     *,
     with_chroma: bool = True,
-) -> None:
-    """One Gauss-Newton step, in place. Sources that are new begin at their prior, or as of `_begin`.
+) -> Linear:
+    """One Gauss-Newton step, in place; returned is the objective before it.
+
+    Sources that are new begin at their prior, or as of `_begin`.
 
     with_chroma: solve (2) too; else sources keep their chroma.
 
@@ -170,13 +84,66 @@ def step(
     """
     switches, count = switches or Switches(), sources.count
     finds_level = switches.albedos and sources.finds_level
+    here = _linearised(unknowns, evidence, sources, switches)
+    unknowns.keep(here.curvature)
+    change = unknowns.solve(here.slope)
+    change *= min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
+    change *= unknowns.relax(change[:count])
+    if finds_level:
+        change += _follow_level(unknowns, here, change)
+    parts = here.paint.design[:, :count]
+    unknowns.step = float(np.sqrt(np.mean((parts @ change[:count].astype(np.float32)) ** 2)))
+    unknowns.z = here.z + change[:count]
+    unknowns.materials[here.nodes] += change[count:]
+    unknowns.offsets[evidence.rows] = here.paint.offsets(change)
+    if with_chroma:
+        unknowns.chroma = solve_chroma(
+            parts,
+            here.seen,
+            here.sent_chroma,
+            here.paint.surfaces.regions,
+            sources.pairs,
+            brightest(here.paint.albedos(change), ~evidence.is_clipped) if finds_level else None,
+            finds_albedos=switches.albedos,
+        )
+    unknowns.radiance = _radiance(unknowns, sources)
+    return here
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The objective about the unknowns as they are, with the derivatives of (1)."""
+
+    z: Floats
+    """[k] of all sources."""
+    nodes: Ints
+    """[albedos] of the patches' materials."""
+    paint: Paint
+    arriving: Floats
+    """[n] radiance that patches receive: the sum in (1)."""
+    seen: Floats
+    """[n, 2] chroma that they show, without what photographed surface brings."""
+    sent_chroma: Floats
+    """[n, 2] of what they receive from sources."""
+    curvature: Singles
+    """[k + albedos] squared, half the second derivative."""
+    slope: Floats
+    """[k + albedos] downwards, half of it."""
+    spread: float
+    """s_m."""
+
+
+def _linearised(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Switches) -> Linear:
+    """Where sources are new, at their prior, or as of `_begin`; the unknowns know them from then on."""
+    count = sources.count
+    finds_level = switches.albedos and sources.finds_level
     middle = _begin_level(unknowns, evidence, finds_level=finds_level, has_materials=switches.albedos)
-    prior = _prior(unknowns, sources)
+    prior = unknowns.prior(sources)
     known = sources.known_level
     offsets = _means(unknowns.offsets[evidence.rows], evidence.surfaces)
     z = np.concatenate([unknowns.z, prior[unknowns.known :]])
     z += _begin(z, unknowns.known, evidence, sources, known, np.log(logistic(middle)) + offsets)
-    unknowns.chroma = np.concatenate([unknowns.chroma, np.zeros((count - unknowns.known, 2))])
+    unknowns.z, unknowns.chroma = z, np.concatenate([unknowns.chroma, np.zeros((count - len(unknowns.chroma), 2))])
 
     level = _levels(z, sources).astype(np.float32)
     arriving = np.maximum(sources.shares @ level + known, DARKEST)
@@ -192,51 +159,35 @@ def step(
     counts[sources.says_nothing] = 0.0
 
     design = _design(sources.shares, level, arriving, (1 - albedo)[:, None] * materials)
-    parts = design[:, :count]
     spreads = _albedo_spreads(switches, finds_level=finds_level)
     regions = Regions.of(design, counts, evidence)
     whitest = -_means(np.log(albedo), evidence.surfaces)
     surfaces = _albedo_offsets(offsets, whitest, regions, spreads)
     residual = residual - surfaces.center[evidence.surfaces]
     matrix, vector = surfaces.normal_equations(design, residual[:, None])
-    right = vector[:, 0].astype(np.float64)
-    right[:count] -= _smoothen(matrix, z, sources.pairs)
+    slope = vector[:, 0].astype(np.float64)
+    slope[:count] -= _smoothen(matrix, z, sources.pairs)
     bent, pull = _priors(z - prior, sources, unknowns.materials[nodes] - middle, spreads.material)
     matrix[np.diag_indices_from(matrix)] += bent
-    unknowns.keep(matrix)
-    change = unknowns.solve(right + pull)
-    change *= min(1.0, MOST_STEP / max(float(np.abs(change).max()), 1e-12))
-    change *= unknowns.relax(change[:count])
     paint = Paint(materials, unknowns.materials[nodes], design, residual, surfaces, evidence)
-    if finds_level:
-        change += _follow_level(unknowns, nodes, paint, change, seen - sent_chroma, spreads.material)
-    unknowns.step = float(np.sqrt(np.mean((parts @ change[:count].astype(np.float32)) ** 2)))
-    unknowns.z = z + change[:count]
-    unknowns.materials[nodes] += change[count:]
-    unknowns.offsets[evidence.rows] = paint.offsets(change)
-    if with_chroma:
-        unknowns.chroma = solve_chroma(
-            parts,
-            seen,
-            sent_chroma,
-            regions,
-            sources.pairs,
-            brightest(paint.albedos(change), ~evidence.is_clipped) if finds_level else None,
-            finds_albedos=switches.albedos,
-        )
-    unknowns.radiance = _radiance(unknowns, sources)
+    return Linear(z, nodes, paint, arriving, seen, sent_chroma, matrix, slope + pull, spreads.material)
+
+
+def profile(unknowns: Unknowns, here: Linear, columns: Singles) -> tuple[Floats, Floats]:
+    """Half the slope [m] downwards, and half the curvature [m, m], of the objective by what is no unknown yet.
+
+    All unknowns go along as the curvature tells, which `unknowns` have kept. columns: [n, m] derivatives of (1).
+    """
+    across, own, slope = here.paint.surfaces.beside(here.paint.design, columns, here.paint.residual)
+    along = cho_solve(unknowns.factor, across, check_finite=False)
+    return (slope - along.T @ here.slope).astype(np.float64), (own - across.T @ along).astype(np.float64)
 
 
 def received(unknowns: Unknowns, sources: Sources) -> Floats:
     """[n] the logarithm of (1) without albedo: what patches receive. Sources that are new are at their prior."""
-    z = np.concatenate([unknowns.z, _prior(unknowns, sources)[unknowns.known :]])
+    z = np.concatenate([unknowns.z, unknowns.prior(sources)[unknowns.known :]])
     level = _levels(z, sources).astype(np.float32)
     return np.log(np.maximum(sources.shares @ level + sources.known_level, DARKEST))
-
-
-def _prior(unknowns: Unknowns, sources: Sources) -> Floats:
-    """[k] n, but for floor that was not scanned."""
-    return np.asarray(np.where(sources.is_saturated, 0.0, unknowns.mean) + sources.offset)
 
 
 def _priors(above: Floats, sources: Sources, materials: Floats, spread: float) -> tuple[Floats, Floats]:
@@ -284,17 +235,11 @@ def _begin_level(unknowns: Unknowns, evidence: Evidence, *, finds_level: bool, h
 
     has_materials: albedos are found; else all of them are the given one.
     """
-    middle = unknowns.middle if finds_level else _given_logit(has_materials=has_materials)
+    middle = unknowns.middle if finds_level else given_logit(has_materials=has_materials)
     unknowns.mean = float(np.log(evidence.mean / (1.0 if finds_level else logistic(middle))))
     if unknowns.known == 0:
         unknowns.materials[:] = middle
     return middle
-
-
-def _given_logit(*, has_materials: bool) -> float:
-    """Of the mean albedo where it is not found."""
-    given = weights.DISTANT_ALBEDO if has_materials else weights.GIVEN_ALBEDO
-    return float(np.log(given / (1 - given)))
 
 
 def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: Floats, albedos: Floats) -> Floats:
@@ -316,21 +261,18 @@ def _begin(z: Floats, count: int, evidence: Evidence, sources: Sources, known: F
     return np.where(is_new, BEGIN_EXCESS[errors.argmin()], 0.0)
 
 
-def _follow_level(
-    unknowns: Unknowns, nodes: Ints, paint: Paint, change: Floats, chroma: Floats, spread: float
-) -> Floats:
+def _follow_level(unknowns: Unknowns, here: Linear, change: Floats) -> Floats:
     """[k + albedos] how sources and materials go along with a step of m, which is taken.
 
-    Materials of no patch go along whole: nothing else holds them. nodes: [albedos] of the patches' materials; change:
-    [k + albedos] of the Gauss-Newton step; chroma: [n, 2] of albedo; spread: s_m.
+    Materials of no patch go along whole: nothing else holds them. change: [k + albedos] of the Gauss-Newton step.
     """
     towards_m = np.zeros(len(change))
-    towards_m[-len(paint.logits) :] = 1 / spread**2
+    towards_m[-len(here.nodes) :] = 1 / here.spread**2
     along = unknowns.solve(towards_m)
-    wanted = level_step(unknowns.middle, paint, change, along, chroma)
+    wanted = level_step(unknowns.middle, here.paint, change, along, here.seen - here.sent_chroma)
     taken = unknowns.relaxation * float(np.clip(wanted, -MOST_STEP, MOST_STEP))
     unknowns.middle += taken
-    unknowns.materials[np.setdiff1d(ALL_NODES, nodes)] += taken
+    unknowns.materials[np.setdiff1d(ALL_NODES, here.nodes)] += taken
     return taken * along
 
 

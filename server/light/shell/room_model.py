@@ -27,7 +27,6 @@ from server.light.shell.bright_surface import BrightSurface, TracedEmitters
 from server.light.shell.distant import distant_light
 from server.light.shell.fade import Fade, Told
 from server.light.shell.known_room import KnownRoom
-from server.light.shell.objective import Unknowns
 from server.light.shell.patches import Patches, TracedPatches, patch_side_m
 from server.light.shell.picture import PatchesInPicture, Seen
 from server.light.shell.shell import Shell
@@ -35,6 +34,8 @@ from server.light.shell.solution import Solution
 from server.light.shell.solver import LEAST_PATCHES, STILL
 from server.light.shell.solver_process import Asked, SolverProcess, Task
 from server.light.shell.switches import Switches
+from server.light.shell.unknowns import Unknowns
+from server.light.shell.view import View
 from server.opencl.pacing import Pacer
 from server.volume.integrate import integrate
 from server.volume.volume import Volume
@@ -67,8 +68,7 @@ class _Tracing:
     emitters: list[TracedEmitters]
     arrivals: PendingArrivals
     """Of the patches, then of the emitters."""
-    camera: Floats
-    """[3] world metres."""
+    view: View
     up: Floats
     """[3] unit, world."""
 
@@ -154,8 +154,9 @@ class RoomModel:
         arrivals = begin_arrivals(engine, volume, [traced.rays, *(one.rays for one in emitters)])
         solves_now = waits and (self._is_urgent or is_young)
         self._waiting, self._is_urgent = 0, False
-        camera = context.volume_from_camera[:3, 3] + volume.origin_world
-        self._tracing = _Tracing(volume, traced, emitters, arrivals, camera, up)
+        pose = context.volume_from_camera.copy()
+        pose[:3, 3] += volume.origin_world
+        self._tracing = _Tracing(volume, traced, emitters, arrivals, View.of(context.camera, pose), up)
         if solves_now:
             self.finish()
             self._take_over(engine.pacer)
@@ -179,7 +180,7 @@ class RoomModel:
         patches, bright = self._patches.copy(), self._bright.seen_by()
         new = 1 - self._kept + SOLVE_EVERY / self._frames
         fade = Fade(None if new >= NEW_SHARE else Told.by(self._solution), new)
-        task = Task(patches, bright, tracing.patches.rows, tracing.camera, tracing.up, self._asked(), fade)
+        task = Task(patches, bright, tracing.patches.rows, tracing.view, tracing.up, self._asked(), fade)
         self._next, self._kept = Beside(partial(self._solver.solve, task)), 1.0
 
     def close(self) -> None:

@@ -13,14 +13,14 @@ from scipy.sparse import csc_matrix
 from server.light.arrivals import PendingArrivals, RayGroup, begin_arrivals, trace_arrivals
 from server.light.light_estimation import LightEstimate
 from server.light.place_light import VALID_SPREAD_DEG, PlaceLight
-from server.light.shell.bright_surface import Emitters
 from server.light.shell.distant import distant_light
+from server.light.shell.emitters import Emitters
 from server.light.shell.lamps import ShellLamp, emitting_lamps, find_lamps
 from server.light.shell.patches import Patches
 from server.light.shell.shell import SIDE, Shell
 from server.light.shell.solved import Solved
 from server.light.shell.spread import deviations, spread_deg
-from server.light.shell.transport import KNOWN, NO_CELL, Met, bright_keys, columns_of, meet
+from server.light.shell.transport import KNOWN, NO_CELL, Met, columns_of, emitter_keys, meet
 from server.maths.dominant import MOST_LIGHTS
 from server.maths.sh import LUMINANCE, in_bundles, sh_basis, spherical_fibonacci
 from server.opencl.engine import Engine
@@ -163,7 +163,7 @@ class Solution:
     @cached_property
     def _sent_by_emitters(self) -> tuple[NDArray[np.int64], Floats]:
         """[k] columns, and [k, 3] radiance beyond what is photographed, 0 where no patch has received light."""
-        columns = columns_of(self.hidden, bright_keys(self.emitters.centers))
+        columns = columns_of(self.hidden, emitter_keys(self.emitters))
         is_known = (columns >= 0) & (columns < self.near.known)
         columns = np.where(is_known, columns, 0)
         return columns, np.where(is_known[:, None], self.near.radiance[columns], 0.0)

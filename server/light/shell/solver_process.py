@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from server.children.nursery import ChildDied, JobSpec, Nursery
 from server.children.process_pool import IS_SUPPORTED, ChildProcess
-from server.light.shell.bright_surface import EmittersSeen
+from server.light.shell.emitters import EmittersSeen
 from server.light.shell.fade import Fade
 from server.light.shell.patches import Patches
 from server.light.shell.shell import Shell
 from server.light.shell.solution import Solution
 from server.light.shell.solver import Solver
 from server.light.shell.switches import Switches
+from server.light.shell.view import View
 
 log = logging.getLogger(__name__)
 
@@ -65,8 +66,8 @@ class Task:
     bright: EmittersSeen
     traced: NDArray[np.int64]
     """Rows of the patches whose rays are new."""
-    camera: Floats
-    """[3] world metres."""
+    view: View
+    """Of the newest frame."""
     up: Floats
     """[3] unit, world."""
     asked: Asked
@@ -74,11 +75,11 @@ class Task:
 
     def solve(self, solver: Solver) -> Solution | None:
         """As it is told, with what is asked of it; None where too few patches are known."""
-        solution = solver.solve(self.patches, self.bright, self.traced, self.camera, self.up)
+        solution = solver.solve(self.patches, self.bright, self.traced, self.view, self.up)
         if solution is None:
             return None
         asked = self.asked.positions
-        told = self.fade.told(solution, self.camera if asked is None else asked.mean(axis=0))
+        told = self.fade.told(solution, self.view.eye if asked is None else asked.mean(axis=0))
         self.asked.find(told)
         return told
 

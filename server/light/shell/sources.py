@@ -111,22 +111,23 @@ def distant_sources(transport: Transport, closed: Floats, up: Floats, rows: Ints
     closed: [6] from 0, open, to 1. up: [3] unit, world. The first LOBES sources are the lobes. with_indirect: surfaces
     send light.
     """
-    count = transport.columns
+    columns = np.flatnonzero(~transport.is_lamp[: transport.columns])
+    count = len(columns)
     is_closed = closed.astype(np.float32)
     beyond = np.einsum("nfl,f->nl", transport.beyond[rows], 1 - is_closed)
     shares = np.empty((len(rows), LOBES + count), np.float32)
     shares[:, :LOBES], near = beyond, shares[:, LOBES:]
-    near[:] = transport.shares[rows, :count]
+    near[:] = transport.shares[rows][:, columns]
     near[:, :CELLS] *= np.repeat(is_closed, SIDE * SIDE)
     known = transport.known[rows]
     if not with_indirect:
         near[:, CELLS:], known = 0.0, np.zeros_like(known)
-    offset, deviation = _priors(transport)
+    offset, deviation = (prior[columns] for prior in _priors(transport))
     return Sources(
         shares=shares,
         known=known,
-        clipped=np.concatenate([np.zeros((LOBES, 3)), transport.clipped[:count]]),
-        is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[:count]]),
+        clipped=np.concatenate([np.zeros((LOBES, 3)), transport.clipped[columns]]),
+        is_saturated=np.concatenate([np.zeros(LOBES, bool), transport.is_saturated[columns]]),
         offset=np.concatenate([np.log(weights.LOBE) + weights.LOBE_UP * (lobe_directions() @ up), offset]),
         deviation=np.concatenate([np.full(LOBES, weights.LOBE_SHAPE**-0.5), deviation]),
         pairs=_PAIRS + LOBES,

@@ -7,7 +7,7 @@ another light only, the shell behind it does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -15,27 +15,30 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
-from server.light.shell.bright_surface import CELL_M, EmittersSeen
+from server.light.shell.emitters import Emitters, EmittersSeen, keys_of
 from server.light.shell.patches import MOST_PATCHES, RAYS, Patches, hemisphere_weights, ray_directions
 from server.light.shell.shell import CELLS, CORNERS, FLOOR, SIDE, SIDES, Shell
 from server.maths.lobes import LOBES, lobes_along
 
 HIDDEN_M = 0.6
 """Side of the cells of hidden surface: a piece of furniture. Those of saturated surface are smaller (CELL_M)."""
-MOST_HIDDEN, MOST_SATURATED = 128, 96
+MOST_HIDDEN, MOST_SATURATED, MOST_LAMPS = 128, 96, 2
 """Most cells of each kind. Surface beyond that shares one more cell of its kind: what is hidden must not send as a lamp
 does. Furnished rooms have up to 110 and 55 in a second, the real kitchen 60 and 55 in four."""
 SATURATED, ALL_CHANNELS = 0.97, 0.9
 """Radiance of the strongest channel from which a picture's values are lower bounds, code 252 of 255, and the share of
 it that the weakest has then: where another channel is not clipped, the surface is hardly brighter than it looks."""
-COLUMNS = CELLS + MOST_HIDDEN + 1 + MOST_SATURATED + 1
+COLUMNS = CELLS + MOST_HIDDEN + 1 + MOST_SATURATED + 1 + MOST_LAMPS
 KNOWN, NO_CELL = -1, -2
 """Values in place of a cell: KNOWN is photographed surface; NO_CELL is hidden or saturated surface from which no patch
 has received light."""
 NEAR_SIDES = 2 / 3
 """Surface within so many sides of a patch is near it: of PATCH_M, .1 m."""
-SHARED = -2, -1
-"""Keys of the cells that hidden and saturated surface share, each even or odd as all keys of its kind."""
+HIDDEN, BRIGHT, LAMP = range(3)
+"""Kinds of keys, modulo 3: of hidden and saturated surface, and of lamps that were not seen."""
+SHARED = -3, -2
+"""Keys of the cells that hidden and saturated surface share."""
+_MOST = MOST_HIDDEN, MOST_SATURATED, MOST_LAMPS
 _MIDDLE = 1 << 19  # half the cells along an axis: 150 km
 _AT_ONCE = 64  # patches whose rays are worked on together: 32 768 rays, some MB
 _MOST_COUNTED = 1e4  # rays that the mean of a saturated cell remembers
@@ -78,6 +81,7 @@ class Transport:
         """[SIDE^2, CELLS] share of the shell's cells of the cosine-weighted hemispheres of those of its floor, with
         nothing in between."""
         self.is_saturated = np.zeros(COLUMNS, bool)
+        self.is_lamp = np.zeros(COLUMNS, bool)
         self.clipped: Floats = np.zeros((COLUMNS, 3))
         """[COLUMNS, 3] mean radiance of saturated cells as pictures show it."""
         self.lit: Floats = np.ones(COLUMNS)
@@ -124,11 +128,11 @@ class Transport:
         ends = np.take(positions, row, axis=0) + np.abs(arrivals[:, 3:]) * np.take(ray_directions(), ray, axis=0)
         back, bright = arrivals[:, 3] < 0, _is_bright(arrivals)
         keys = _back_keys(ends[back])
-        self._add_cells(keys, is_saturated=False)
+        self._add_cells(keys, HIDDEN)
         np.add.at(sums.reshape(-1), COLUMNS * row[back] + columns_of(self.hidden, keys), share[back])
         self._by_rays[rows] = sums
         keys = bright_keys(ends[bright])
-        self._add_cells(keys, is_saturated=True)
+        self._add_cells(keys, BRIGHT)
         self._note_clipped(columns_of(self.hidden, keys), arrivals[bright, :3])
         self._note_bright(rows, rows[row[bright]], share[bright], ends[bright])
         is_near = np.abs(arrivals[:, 3]) < NEAR_SIDES * patches.side_m
@@ -146,8 +150,9 @@ class Transport:
     def _update_emitters(self, patches: Patches, bright: EmittersSeen, rows: Ints, shell: Shell) -> None:
         """Saturated surface: each emitter by a ray of its own, what is large or no emitter by evenly spread rays."""
         emitters = bright.emitters
-        keys = bright_keys(emitters.centers)
-        self._add_cells(keys, is_saturated=True)
+        keys = emitter_keys(emitters)
+        self._add_cells(keys[~emitters.is_unseen], BRIGHT)
+        self._add_cells(keys[emitters.is_unseen], LAMP)
         columns = columns_of(self.hidden, keys)
         self._note_clipped(columns, emitters.radiance)
         self.lit[columns] = emitters.lit_by(patches, shell.axes[2])
@@ -163,14 +168,15 @@ class Transport:
         np.add.at(sums.reshape(-1), COLUMNS * row + columns_of(self.hidden, bright_keys(ends)), counts * ray_shares)
         self.shares[rows] = sums
 
-    def _add_cells(self, keys: Ints, *, is_saturated: bool) -> None:
-        most = MOST_SATURATED if is_saturated else MOST_HIDDEN
+    def _add_cells(self, keys: Ints, kind: int) -> None:
+        of_kind = sum(key % 3 == kind for key in self.hidden)
         for key in sorted(set(keys.tolist()) - self.hidden.keys()):
-            is_full = np.count_nonzero(self.is_saturated[CELLS : self.columns] == is_saturated) >= most
-            number = SHARED[is_saturated] if is_full else key
+            number = key if of_kind < _MOST[kind] else SHARED[kind]
             if number not in self.hidden:
-                self.is_saturated[self.columns] = is_saturated
+                self.is_saturated[self.columns] = kind != HIDDEN
+                self.is_lamp[self.columns] = kind == LAMP
                 self.hidden[number] = self.columns
+                of_kind += 1
 
     def _note_clipped(self, columns: Ints, radiance: Floats) -> None:
         """Fold in the clipped `radiance` [n, 3] of saturated cells `columns` [n]."""
@@ -208,12 +214,24 @@ def floor_shares(shell: Shell) -> NDArray[np.float32]:
 
 def _back_keys(points: Floats) -> Ints:
     """[n] keys of the cells of hidden surface at points [n, 3]."""
-    return np.asarray(2 * _cell_numbers(points, HIDDEN_M))
+    return np.asarray(3 * _cell_numbers(np.floor(points / HIDDEN_M)) + HIDDEN)
 
 
 def bright_keys(points: Floats) -> Ints:
     """[n] keys of the cells of saturated surface at points [n, 3]."""
-    return np.asarray(2 * _cell_numbers(points, CELL_M) + 1)
+    return np.asarray(3 * _cell_numbers(keys_of(points)) + BRIGHT)
+
+
+def lamp_keys(numbers: Sequence[int]) -> Ints:
+    """[k] keys of lamps that were not seen, by their numbers."""
+    cells = np.zeros((len(numbers), 3), np.int64)
+    cells[:, 0] = numbers
+    return np.asarray(3 * _cell_numbers(cells) + LAMP)
+
+
+def emitter_keys(emitters: Emitters) -> Ints:
+    """[k] keys of the emitters' cells."""
+    return np.asarray(3 * _cell_numbers(emitters.keys) + np.where(emitters.is_unseen, LAMP, BRIGHT))
 
 
 def meet(
@@ -229,10 +247,10 @@ def meet(
     shares = np.zeros((*distance.shape, CORNERS))
     place, ray = np.nonzero(is_free)
     columns[place, ray], shares[place, ray] = shell.exits(origins[place], directions[place, ray])
-    for chosen, keys_of in ((is_back, _back_keys), (is_bright, bright_keys)):
+    for chosen, keys in ((is_back, _back_keys), (is_bright, bright_keys)):
         place, ray = np.nonzero(chosen)
         ends = origins[place] + np.abs(distance[place, ray])[:, None] * directions[place, ray]
-        columns[place, ray] = columns_of(hidden, keys_of(ends))[:, None]
+        columns[place, ray] = columns_of(hidden, keys(ends))[:, None]
         shares[place, ray, 0] = 1.0
     known = arrivals[..., :3] * (distance > 0)[..., None]
     return Met(columns, shares, known, is_bright, np.abs(distance))
@@ -256,16 +274,16 @@ def _is_bright(arrivals: NDArray[np.floating]) -> NDArray[np.bool_]:
     return np.asarray((arrivals[..., 3] > 0) & (most >= SATURATED) & (least >= ALL_CHANNELS * most))
 
 
-def _cell_numbers(points: Floats, side_m: float) -> Ints:
-    parts = np.floor(points / side_m).astype(np.int64) + _MIDDLE
+def _cell_numbers(cells: Floats | Ints) -> Ints:
+    parts = cells.astype(np.int64) + _MIDDLE
     return np.asarray((parts[:, 0] * 2 * _MIDDLE + parts[:, 1]) * 2 * _MIDDLE + parts[:, 2])
 
 
 def columns_of(hidden: Mapping[int, int], keys: Ints) -> Ints:
     """[n] columns by the `keys` [n] of cells; where there is no such cell the one that others share, or NO_CELL."""
     found, inverse = np.unique(keys, return_inverse=True)
-    shared = [hidden.get(key, NO_CELL) for key in SHARED]
-    columns = np.array([hidden.get(int(key), shared[key % 2]) for key in found], np.int64)
+    shared = [*(hidden.get(key, NO_CELL) for key in SHARED), NO_CELL]
+    columns = np.array([hidden.get(int(key), shared[key % 3]) for key in found], np.int64)
     return np.asarray(columns[inverse.ravel()])
 
 

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.light.shell.distant import distant_light
-from server.light.shell.objective import Unknowns, step
+from server.light.shell.objective import step
 from server.light.shell.shell import SIDES
 from server.light.shell.sources import distant_sources
 from server.light.shell.transport import Transport
+from server.light.shell.unknowns import Unknowns
 from server.maths.lobes import LOBES
 from server.maths.sh import LUMINANCE
 from tests.hard_cases.catalogue import Family, Found, Trial

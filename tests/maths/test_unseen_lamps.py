@@ -1,0 +1,140 @@
+"""Lamps in air that no picture has looked through, in a room in closed form (tests/scenes/shell_room.py)."""
+
+from __future__ import annotations
+
+from math import tan
+
+import numpy as np
+import pytest
+
+from protocol.frames import CameraModel
+from server.light.shell.emitters import Emitters
+from server.light.shell.patches import RAYS, ray_directions
+from server.light.shell.solution import Solution
+from server.light.shell.solver import Solver
+from server.light.shell.switches import Switches
+from server.light.shell.transport import columns_of, emitter_keys
+from server.light.shell.unseen_lamps import AGAIN, BULB_M, lamp_shares
+from server.light.shell.view import View
+from tests.scenes.analytic import Floats
+from tests.scenes.shell_room import AWAY, CAMERA, NO_EMITTERS, UP, Lamp, ShellRoom, make_room
+
+PLACES = [(1.35, 1.05, 1.35), (2.6, 0.9, 1.0), (0.9, 2.3, 1.7)]
+RADIANCE = 60.0
+"""Of a lamp of BULB_M: 200 times that of what else is not scanned."""
+AMBIENT = (0.3, 0.3, 0.3)
+ENOUGH = AGAIN + 5
+"""Solutions until a lamp is found and has come to its place."""
+
+
+def lit_room(place: tuple[float, float, float], radiance: float = RADIANCE) -> ShellRoom:
+    """A room with a round lamp in its air."""
+    room = make_room(None, AMBIENT)
+    rows = room.patches.used
+    away = np.array(place) - room.patches.positions[rows]
+    squared = (away**2).sum(axis=1)
+    cosine = np.maximum((away * room.patches.normals[rows]).sum(axis=1), 0.0) / np.sqrt(squared)
+    without = AMBIENT[0] * room.transport.shares[rows].sum(axis=1) + room.transport.known[rows].mean(axis=1)
+    brought = radiance * BULB_M**2 * cosine / squared
+    room.patches.logarithms[rows] += np.log1p(brought / without)[:, None]
+    return room
+
+
+def solved(solver: Solver, room: ShellRoom, view: View = AWAY, times: int = ENOUGH) -> Solution:
+    for _ in range(times):
+        solution = solver.solve(room.patches, NO_EMITTERS, room.patches.used, view, UP)
+    assert solution is not None
+    return solution
+
+
+def lamps_of(solution: Solution) -> Emitters:
+    return solution.emitters.only(np.flatnonzero(solution.emitters.is_unseen))
+
+
+def looking_at(place: tuple[float, float, float], half_deg: float = 15.0) -> View:
+    """From the camera."""
+    ahead = np.array(place) - CAMERA
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, UP)
+    right /= np.linalg.norm(right)
+    half = tan(np.radians(half_deg))
+    return View(CAMERA, np.stack([right, np.cross(ahead, right), ahead], axis=1), (-half, half), (-half, half))
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_lamp_is_found_at_its_place(place: tuple[float, float, float]) -> None:
+    solution = solved(Solver(Switches()), lit_room(place))
+    lamps = lamps_of(solution)
+    assert lamps.count == 1
+    assert np.linalg.norm(lamps.centers[0] - place) < 0.1  # seen: .02, .02, .06
+    sent = solution.near.radiance[columns_of(solution.hidden, emitter_keys(lamps))[0]]
+    assert sent.mean() == pytest.approx(RADIANCE, rel=0.2)  # seen: 54, 56, 61
+
+
+def test_light_from_the_shell_is_no_lamp_in_the_air() -> None:
+    on_ceiling = make_room(Lamp((1.9, 1.6), 0.8, (9.0, 9.0, 9.0)), AMBIENT)
+    for room in (on_ceiling, make_room(None, AMBIENT)):
+        assert lamps_of(solved(Solver(Switches()), room)).count == 0
+
+
+def test_none_is_found_before_it_has_been_found_often() -> None:
+    solver, room = Solver(Switches()), lit_room(PLACES[0])
+    assert lamps_of(solved(solver, room, times=AGAIN)).count == 0
+    assert lamps_of(solved(solver, room, times=1)).count == 1
+
+
+def test_none_is_where_pictures_look() -> None:
+    room, place = lit_room(PLACES[0]), PLACES[0]
+    lamps = lamps_of(solved(Solver(Switches()), room, looking_at(place)))
+    assert all(np.linalg.norm(lamps.centers - place, axis=1) > 0.2)
+    solver = Solver(Switches())
+    assert lamps_of(solved(solver, room)).count == 1
+    assert lamps_of(solved(solver, room, looking_at(place), times=1)).count == 0  # nothing shines there
+
+
+def test_a_lamp_that_goes_out_goes() -> None:
+    solver = Solver(Switches())
+    assert lamps_of(solved(solver, lit_room(PLACES[0]))).count == 1
+    assert lamps_of(solved(solver, make_room(None, AMBIENT))).count == 0
+
+
+def test_another_light_has_other_lamps() -> None:
+    solver, room = Solver(Switches()), lit_room(PLACES[1])
+    assert lamps_of(solved(solver, lit_room(PLACES[0]))).count == 1
+    room.patches.outdated = 1.0
+    assert lamps_of(solved(solver, room, times=1)).count == 0
+    room.patches.outdated = 0.0
+    lamps = lamps_of(solved(solver, room))
+    assert lamps.count == 1
+    assert np.linalg.norm(lamps.centers[0] - PLACES[1]) < 0.2
+
+
+def test_patches_see_a_lamp_as_far_as_their_rays_go() -> None:
+    room = make_room(None, AMBIENT)
+    patches, rows = room.patches, room.patches.used
+    place = np.array([PLACES[0]])
+    patches.arrivals[rows] = 0.0
+    shares, visible = lamp_shares(patches, rows, place)
+    away = place - patches.positions[rows]
+    far = np.linalg.norm(away, axis=1)
+    cosine = np.maximum((away * patches.normals[rows]).sum(axis=1), 0.0) / far
+    np.testing.assert_allclose(shares[:, 0], cosine * (BULB_M / far) ** 2, rtol=0.02)  # 1 / (1 + (BULB_M / far)^2)
+    assert (visible == 1).all()
+    patches.arrivals[rows, :, 3] = 1.0  # surface a metre away all around
+    np.testing.assert_array_equal(lamp_shares(patches, rows, place)[1][:, 0], far <= 1.0)
+    above = ray_directions() @ away[0] > far[0] * np.cos(np.radians(30))
+    patches.arrivals[rows[0], :, 3] = np.where(above, 0.0, 0.1)
+    assert above.sum() < RAYS / 10
+    assert lamp_shares(patches, rows[:1], place)[1] == 1
+
+
+def test_a_view_frames_what_its_camera_shows() -> None:
+    camera = CameraModel(width=64, height=48, fx=50.0, fy=55.0, cx=30.0, cy=25.0)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.5, 0.2, 1.0]
+    pixels = np.array([(0.1, 0.1), (62.9, 46.9), (-0.1, 20), (63.1, 20), (20, -0.1), (20, 47.1)])
+    rays = np.stack([(pixels[:, 0] - 30) / 50, (pixels[:, 1] - 25) / 55, np.ones(6)], axis=1)
+    points: Floats = pose[:3, 3] + 2.0 * rays @ pose[:3, :3].T
+    view = View.of(camera, pose)
+    np.testing.assert_array_equal(view.frames(points), [True, True, False, False, False, False])
+    assert not view.frames(2 * view.eye - points).any()  # behind it

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from server.light.arrivals import begin_arrivals
-from server.light.shell.bright_surface import CELL_M, BrightSurface
+from server.light.shell.bright_surface import BrightSurface
+from server.light.shell.emitters import CELL_M
 from server.light.shell.patches import GRIDS, PATCH_M, Patches
 from server.light.shell.picture import Seen, SeenBright
 from server.opencl.engine import Engine

@@ -15,7 +15,7 @@ from tests.bench.light.sensitivity import CONSTANTS, Constant, set_before_import
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "light.md"
-ELSEWHERE = ("solver", "transport", "fade")
+ELSEWHERE = ("solver", "transport", "fade", "unseen_lamps", "emitters")
 """Modules with constants that the page lists besides those of CONSTANTS."""
 
 

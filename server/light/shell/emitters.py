@@ -29,10 +29,10 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Emitters:
-    """Cells of saturated surface at one frame. [k] emitters, world axes and metres."""
+    """Cells of saturated surface at one frame, and lamps that no picture has shown. [k] emitters, world axes, metres."""
 
     keys: NDArray[np.int64]
-    """[k, 3] of the grid."""
+    """[k, 3] of the grid of CELL_M; of lamps, their number first."""
     centers: Floats
     """[k, 3]."""
     facing: Floats
@@ -42,7 +42,7 @@ class Emitters:
     areas_m2: Floats
     """[k] as seen from the front."""
     radiance: Floats
-    """[k, 3] as clipped."""
+    """[k, 3] as clipped; of lamps, as what is clipped."""
     presence: Floats
     """[k] from 0 to 1: how far it counts."""
     is_unseen: NDArray[np.bool_]

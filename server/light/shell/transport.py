@@ -1,7 +1,7 @@
 """How radiance travels in a room: from which unknown cells a patch receives light, and what it is known to receive.
 
-Unknown cells are those of the shell, what saturated surface sends beyond what the picture could show, and surface that
-was met from its back or without a colour. Scanned surface sends what the camera saw it send; where it was seen under
+Unknown cells are those of the shell, what saturated surface sends beyond what the picture could show, lamps that no
+picture has shown, and surface that was met from its back or without a colour. Scanned surface sends what the camera saw it send; where it was seen under
 another light only, the shell behind it does.
 """
 
@@ -82,6 +82,7 @@ class Transport:
         nothing in between."""
         self.is_saturated = np.zeros(COLUMNS, bool)
         self.is_lamp = np.zeros(COLUMNS, bool)
+        """[COLUMNS] lamps that no picture has shown; `is_saturated` too, since they are as bright at least."""
         self.clipped: Floats = np.zeros((COLUMNS, 3))
         """[COLUMNS, 3] mean radiance of saturated cells as pictures show it."""
         self.lit: Floats = np.ones(COLUMNS)

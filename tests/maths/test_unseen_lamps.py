@@ -16,6 +16,7 @@ from server.light.shell.switches import Switches
 from server.light.shell.transport import columns_of, emitter_keys
 from server.light.shell.unseen_lamps import AGAIN, BULB_M, lamp_shares
 from server.light.shell.view import View
+from server.maths.sh import spherical_fibonacci
 from tests.scenes.analytic import Floats
 from tests.scenes.shell_room import AWAY, CAMERA, NO_EMITTERS, UP, Lamp, ShellRoom, make_room
 
@@ -126,6 +127,21 @@ def test_patches_see_a_lamp_as_far_as_their_rays_go() -> None:
     patches.arrivals[rows[0], :, 3] = np.where(above, 0.0, 0.1)
     assert above.sum() < RAYS / 10
     assert lamp_shares(patches, rows[:1], place)[1] == 1
+
+
+def test_rays_that_meet_a_lamp() -> None:
+    """As many as its solid angle tells, where nothing is before it."""
+    lamps = lamps_of(solved(Solver(Switches()), lit_room(PLACES[0])))
+    eye, directions = lamps.centers[0] + np.array([0.6, 0.3, -0.4]), spherical_fibonacci(20000)
+    far = np.linalg.norm(lamps.centers[0] - eye)
+    share = (1 - np.sqrt(1 - (BULB_M / far) ** 2)) / 2
+    met = lamps.lamp_met(eye, directions, np.zeros(len(directions)))
+    assert set(met) == {-1, 0}
+    assert (met == 0).mean() == pytest.approx(share, rel=0.05)
+    assert directions[met == 0] @ (lamps.centers[0] - eye) == pytest.approx(far, rel=0.02)
+    behind, before = (np.full(len(directions), far + side) for side in (0.1, -0.1))
+    np.testing.assert_array_equal(lamps.lamp_met(eye, directions, behind), met)
+    assert (lamps.lamp_met(eye, directions, before) == -1).all()
 
 
 def test_a_view_frames_what_its_camera_shows() -> None:

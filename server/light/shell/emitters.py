@@ -29,7 +29,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Emitters:
-    """Cells of saturated surface at one frame, and lamps that no picture has shown. [k] emitters, world axes, metres."""
+    """Cells of saturated surface at one frame, and lamps that no picture has shown. [k], world axes and metres."""
 
     keys: NDArray[np.int64]
     """[k, 3] of the grid of CELL_M; of lamps, their number first."""
@@ -120,6 +120,20 @@ class Emitters:
         # What is as near to its middle is the emitter itself; one that was not seen has no surface.
         own = np.where(self.is_unseen, 0.0, np.sqrt(areas) + 2 * volume.voxel_m)
         return np.asarray((met == 0) | (met >= distances - own))
+
+    def lamp_met(self, eye: Floats, directions: Floats, distances: NDArray[np.floating]) -> Ints:
+        """[m] which lamp that no picture has shown rays from `eye` [3] along unit `directions` [m, 3] meet; -1: none.
+
+        distances: [m] metres to the surface that they meet, 0 where there is none.
+        """
+        result, nearest = np.full(len(directions), -1), np.where(distances > 0, distances, np.inf)
+        for number in np.flatnonzero(self.is_unseen):
+            towards = self.centers[number] - eye
+            ahead = directions @ towards
+            aside = towards @ towards - ahead**2
+            is_met = (ahead > 0) & (ahead < nearest) & (np.pi * aside < self.areas_m2[number])
+            result[is_met], nearest[is_met] = number, ahead[is_met]
+        return result
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,11 @@ class Solution:
         """[m, 3] radiance that arrives at `position` [3] (world) against `directions` [m, 3]."""
         rays = RayGroup(position[None] - volume.origin_world, None, directions[None])
         arrivals = trace_arrivals(engine, volume, rays)
-        return np.asarray(self._radiance_of(self._met(position[None], directions, arrivals))[0])
+        met = self._met(position[None], directions, arrivals)
+        radiance = np.array(self._radiance_of(met)[0], np.float64)
+        lamp = self.emitters.lamp_met(position, directions, met.distances[0])
+        radiance[lamp >= 0] = self._sent_by_emitters[1][lamp[lamp >= 0]]
+        return radiance
 
     def look_up(self, engine: Engine, volume: Volume, positions: Floats) -> LookUp:
         """Begin to trace what `arriving` needs for each of `positions` [n, 3] (world)."""

@@ -1,8 +1,8 @@
 """How radiance travels in a room: from which unknown cells a patch receives light, and what it is known to receive.
 
 Unknown cells are those of the shell, what saturated surface sends beyond what the picture could show, lamps that no
-picture has shown, and surface that was met from its back or without a colour. Scanned surface sends what the camera saw it send; where it was seen under
-another light only, the shell behind it does.
+picture has shown, and surface that was met from its back or without a colour. Scanned surface sends what the camera saw
+it send; where it was seen under another light only, the shell behind it does.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from server.light.shell.emitters import Emitters, EmittersSeen
 from server.light.shell.objective import Linear, profile
@@ -238,4 +239,4 @@ def _table_of_rays() -> Ints:
     polar = (np.arange(rows)[:, None] + 0.5) / rows * np.pi
     turn = ((np.arange(columns)[None] + 0.5) / columns - 0.5) * 2 * np.pi
     x, y, z = np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar) + 0 * turn
-    return np.argsort(-(np.stack([x, y, z], axis=-1) @ ray_directions().T), axis=-1)[..., :NEAREST_RAYS]
+    return np.asarray(KDTree(ray_directions()).query(np.stack([x, y, z], axis=-1), NEAREST_RAYS)[1])

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import tan
 
 import numpy as np
 import pytest
 
 from protocol.frames import CameraModel
+from server.light.shell.elimination import Regions
 from server.light.shell.emitters import Emitters
+from server.light.shell.objective import step
 from server.light.shell.patches import RAYS, ray_directions
 from server.light.shell.solution import Solution
 from server.light.shell.solver import Solver
 from server.light.shell.switches import Switches
 from server.light.shell.transport import columns_of, emitter_keys
-from server.light.shell.unseen_lamps import AGAIN, BULB_M, lamp_shares
+from server.light.shell.unknowns import Unknowns
+from server.light.shell.unseen_lamps import AGAIN, BULB_M, Room, lamp_shares
 from server.light.shell.view import View
 from server.maths.sh import spherical_fibonacci
 from tests.scenes.analytic import Floats
@@ -108,6 +112,28 @@ def test_another_light_has_other_lamps() -> None:
     lamps = lamps_of(solved(solver, room))
     assert lamps.count == 1
     assert np.linalg.norm(lamps.centers[0] - PLACES[1]) < 0.2
+
+
+def test_what_a_place_gains_is_by_how_much_the_quadratic_objective_falls_further() -> None:
+    """The one about a first step, far from its minimum: with a column more, and all others going along."""
+    room, unknowns = lit_room(PLACES[0]), Unknowns()
+    evidence = room.evidence
+    here = step(unknowns, evidence, room.near)
+    solution = Room(unknowns, here, room.patches, evidence.rows, room.shell)
+    place = np.array(PLACES[:1])
+    column = solution.columns(place)
+    column /= np.linalg.norm(column)
+    paint, known = here.paint, len(here.slope)
+    design = np.concatenate([paint.design, column], axis=1)
+    regions = Regions.of(design, paint.surfaces.regions.counts, evidence)
+    matrix, vector = replace(paint.surfaces, regions=regions).normal_equations(design, paint.residual[:, None])
+    matrix[:known, :known] = here.curvature
+    slope = np.append(here.slope, vector[-1, 0])
+    falls = [
+        (slope[:n] @ np.linalg.solve(matrix[:n, :n].astype(np.float64), slope[:n])) / 2 for n in (known, known + 1)
+    ]
+    assert solution.gains(place)[0] == pytest.approx(falls[1] - falls[0], rel=0.02)
+    assert falls[1] - falls[0] > 10
 
 
 def test_patches_see_a_lamp_as_far_as_their_rays_go() -> None:

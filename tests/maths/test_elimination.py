@@ -56,7 +56,7 @@ def test_further_columns_add_to_them_what_all_columns_together_have() -> None:
 
     matrix, vector = offsets(design).normal_equations(design, residuals[:, None])
     few = design[:, :COLUMNS]
-    across, own, slope = offsets(few).beside(few, design[:, COLUMNS:], residuals)
+    across, own, slope = offsets(few).beside(few, residuals).blocks(design[:, COLUMNS:])
     np.testing.assert_allclose(across, matrix[:COLUMNS, COLUMNS:], rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(own, matrix[COLUMNS:, COLUMNS:], rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(slope, vector[COLUMNS:, 0], rtol=1e-4, atol=1e-4)

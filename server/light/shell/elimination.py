@@ -104,20 +104,17 @@ class Offsets:
         matrix[np.ix_(used, used)], vector[used] = self._equations(design[:, used], sums[:, used], residuals)
         return matrix, vector
 
-    def beside(self, design: Singles, columns: Singles, residuals: Floats) -> tuple[Singles, Singles, Singles]:
-        """What `columns` [n, m] add to the normal equations of `design` [n, c], without the offsets: [c, m] beside the
-        matrix, [m, m] and [m] below it and the vector. residuals: [n] from which `center` was taken."""
-        of_design, of_columns = self._left(design, self.regions.sums), self._of(columns)
-        of_residuals = self._of(residuals[:, None].astype(np.float32))
-        across, own, vector = (_product(one, of_columns) for one in (of_design, of_columns, of_residuals))
-        return across, own, vector[0]
+    def beside(self, design: Singles, residuals: Floats) -> Beside:
+        """The normal equations of `design` [n, c] for residuals [n] from which `center` was taken, for more columns."""
+        return Beside(self, self._left(design, self.regions.sums), self.left(residuals[:, None].astype(np.float32)))
 
     def _equations(self, design: Singles, sums: Singles, residuals: Floats) -> tuple[Singles, Singles]:
         """As of normal_equations. sums: [regions, c] those of `design`."""
         of_design = self._left(design, sums)
-        return _product(of_design, of_design), _product(of_design, self._of(residuals.astype(np.float32)))
+        return _product(of_design, of_design), _product(of_design, self.left(residuals.astype(np.float32)))
 
-    def _of(self, values: Singles) -> tuple[Singles, Singles]:
+    def left(self, values: Singles) -> tuple[Singles, Singles]:
+        """As of _left."""
         return self._left(values, self.regions.sums_of(values))
 
     def _left(self, values: Singles, sums: NDArray[Any]) -> tuple[Singles, Singles]:
@@ -159,6 +156,22 @@ class Offsets:
     def _sums(self, by_region: NDArray[Any]) -> NDArray[Any]:
         """[surfaces, ...] of sums over regions [regions, ...]."""
         return np.asarray(self._kept @ by_region)
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Normal equations to which columns may be added. Offsets are eliminated."""
+
+    offsets: Offsets
+    of_design: tuple[Singles, Singles]
+    of_residuals: tuple[Singles, Singles]
+    """As of Offsets.left."""
+
+    def blocks(self, columns: Singles) -> tuple[Singles, Singles, Singles]:
+        """What `columns` [n, m] add: [c, m] beside the matrix, [m, m] and [m] below it and the vector."""
+        of_columns = self.offsets.left(columns)
+        across, own, vector = (_product(one, of_columns) for one in (self.of_design, of_columns, self.of_residuals))
+        return across, own, vector[0]
 
 
 def add_smoothness(matrix: Singles, pairs: Ints, strength: Floats | float) -> None:

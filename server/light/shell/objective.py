@@ -38,6 +38,7 @@ counts 1 / (1 + (e_p / LUMINOUS)^4) for positive e_p.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ from scipy.linalg import cho_solve
 
 from server.light.shell import weights
 from server.light.shell.chroma import solve_chroma
-from server.light.shell.elimination import Offsets, Regions, add_smoothness
+from server.light.shell.elimination import Beside, Offsets, Regions, add_smoothness
 from server.light.shell.evidence import DARKEST, LOG_CHROMA, Evidence, materials_of
 from server.light.shell.level import Paint, brightest, level_step, logistic
 from server.light.shell.patches import GRIDS
@@ -132,6 +133,11 @@ class Linear:
     spread: float
     """s_m."""
 
+    @cached_property
+    def beside(self) -> Beside:
+        """For more columns than those of the unknowns."""
+        return self.paint.surfaces.beside(self.paint.design, self.paint.residual)
+
 
 def _linearised(unknowns: Unknowns, evidence: Evidence, sources: Sources, switches: Switches) -> Linear:
     """Where sources are new, at their prior, or as of `_begin`; the unknowns know them from then on."""
@@ -178,7 +184,7 @@ def profile(unknowns: Unknowns, here: Linear, columns: Singles) -> tuple[Floats,
 
     All unknowns go along as the curvature tells, which `unknowns` have kept. columns: [n, m] derivatives of (1).
     """
-    across, own, slope = here.paint.surfaces.beside(here.paint.design, columns, here.paint.residual)
+    across, own, slope = here.beside.blocks(columns)
     along = cho_solve(unknowns.factor, across, check_finite=False)
     return (slope - along.T @ here.slope).astype(np.float64), (own - across.T @ along).astype(np.float64)
 

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from server.light.shell.emitters import Emitters, EmittersSeen
 from server.light.shell.objective import Linear, profile
-from server.light.shell.patches import MOST_PATCHES, Patches, ray_directions
+from server.light.shell.patches import MOST_PATCHES, RAYS, Patches, ray_directions
 from server.light.shell.shell import Shell
 from server.light.shell.transport import MOST_LAMPS
 from server.light.shell.unknowns import Unknowns
@@ -49,7 +49,8 @@ SEEN_DEG, SEEN_M = 4.0, 0.2
 of .15 m are so far apart at two metres."""
 NEAREST_RAYS = 8
 """Rays of a patch that tell how far it sees a place: half its rays lie in a hemisphere, so these in 10 degrees."""
-_TABLE = 64, 128  # rows and columns of 3 degrees
+TABLE = 64
+"""Cells along a side of the table that tells which rays these are."""
 _DIFFERENCE_M = 0.15  # over less, what patches see changes by jumps
 
 Floats = NDArray[np.float64]
@@ -210,33 +211,48 @@ def _directions(points: Floats, eye: Floats) -> tuple[Floats, Floats]:
     return towards / far[:, None], far
 
 
-def lamp_shares(patches: Patches, rows: Ints, places: Floats) -> tuple[Floats, Floats]:
+def lamp_shares(patches: Patches, rows: Ints, places: Floats) -> tuple[Singles, Singles]:
     """[n, m] shares of the cosine-weighted hemispheres of the patches in `rows` [n] that lamps at `places` [m, 3] fill,
-    and how far patches see them, from 0 to 1, by the rays of each that point nearest there."""
-    towards = places[None] - patches.positions[rows][:, None]
-    far = np.maximum(np.linalg.norm(towards, axis=2), 1e-6)
-    towards /= far[..., None]
-    cosines = np.maximum(np.einsum("nmc,nc->nm", towards, patches.normals[rows]), 0.0)
-    area = np.pi * BULB_M**2
-    met = np.abs(patches.arrivals[rows[:, None, None], _nearest_rays(towards), 3])
-    visible = ((met == 0) | (met >= far[..., None])).mean(axis=-1)
-    return cosines * area / (np.pi * far**2 + area), visible
+    and how far patches see them, from 0 to 1, by the rays of each that point nearest there; 0 where the share is 0."""
+    # An axis at a time, in single precision: there are hundreds of thousands.
+    positions, normals = (part[rows].T[:, :, None].astype(np.float32) for part in (patches.positions, patches.normals))
+    x, y, z = places.T[:, None].astype(np.float32) - positions
+    squared = x * x + y * y + z * z
+    far = np.sqrt(np.maximum(squared, 1e-12))
+    cosines = np.maximum((x * normals[0] + y * normals[1] + z * normals[2]) / far, 0.0)
+    area = np.float32(np.pi * BULB_M**2)
+    above = np.flatnonzero(cosines)
+    first_ray, far = RAYS * rows[above // len(places)], far.take(above)
+    cells = _cells(*(along.take(above) for along in (x, y, z)))
+    counts = np.zeros(len(above), np.float32)
+    for nearest in _table_of_rays():
+        met = np.abs(patches.arrivals.reshape(-1).take(4 * (first_ray + nearest.take(cells)) + 3))
+        counts += (met == 0) | (met >= far)
+    visible = np.zeros_like(cosines)
+    visible.reshape(-1)[above] = counts / NEAREST_RAYS
+    return cosines * area / (np.float32(np.pi) * squared + area), visible
 
 
-def _nearest_rays(directions: Floats) -> Ints:
-    """[..., NEAREST_RAYS] numbers of the ray_directions nearest to `directions` [..., 3], unit, to 3 degrees."""
-    rows, columns = _TABLE
-    row = (np.arccos(np.clip(directions[..., 2], -1.0, 1.0)) * (rows / np.pi)).astype(np.int64)
-    turn = np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi) + 0.5
-    column = (turn * columns).astype(np.int64)
-    return np.asarray(_table_of_rays()[np.minimum(row, rows - 1), np.minimum(column, columns - 1)])
+def _cells(x: Singles, y: Singles, z: Singles) -> Ints:
+    """[n] cells of _table_of_rays of directions of any length, [n] each.
+
+    On the octahedron |x| + |y| + |z| = 1, whose lower half is folded outward.
+    """
+    size = np.abs(x) + np.abs(y) + np.abs(z)
+    first, second = x / size, y / size
+    folded = np.copysign(1 - np.abs(second), first), np.copysign(1 - np.abs(first), second)
+    first, second = np.where(z < 0, folded[0], first), np.where(z < 0, folded[1], second)
+    row, column = (np.clip((along + 1) * (TABLE / 2), 0, TABLE - 1).astype(np.int64) for along in (first, second))
+    return np.asarray(TABLE * row + column)
 
 
 @cache
 def _table_of_rays() -> Ints:
-    """[rows, columns, NEAREST_RAYS] by the polar angle from z and the turn around it."""
-    rows, columns = _TABLE
-    polar = (np.arange(rows)[:, None] + 0.5) / rows * np.pi
-    turn = ((np.arange(columns)[None] + 0.5) / columns - 0.5) * 2 * np.pi
-    x, y, z = np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar) + 0 * turn
-    return np.asarray(KDTree(ray_directions()).query(np.stack([x, y, z], axis=-1), NEAREST_RAYS)[1])
+    """[NEAREST_RAYS, TABLE^2] numbers of the ray_directions nearest to the middle of each cell, 3 degrees wide."""
+    steps = (np.arange(TABLE) + 0.5) * 2 / TABLE - 1
+    first, second = (side.ravel() for side in np.meshgrid(steps, steps, indexing="ij"))
+    z = 1 - np.abs(first) - np.abs(second)
+    outward = np.maximum(-z, 0.0)
+    directions = np.stack([first - np.copysign(outward, first), second - np.copysign(outward, second), z], axis=-1)
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return np.ascontiguousarray(KDTree(ray_directions()).query(directions, NEAREST_RAYS)[1].T)

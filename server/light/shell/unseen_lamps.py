@@ -35,8 +35,8 @@ FROM_SIDES_M, OVER_FLOOR_M = 0.2, 0.6
 """Least distance from the shell's sides, on which lamps have a place, and height: of a lamp on a low table."""
 LIKELY, FOUND = 8.0, 15.0
 """By how much a lamp makes what pictures show more probable (natural logarithm), before its place is looked at closely,
-and at its place. In rooms with such a lamp it is 25 to 43 after a second, in others 13 at most, for a moment 18
-(docs/light_experiments.md)."""
+and at its place. In rooms with such a lamp it is 25 to 43 after a second; in others 13 at most, before that for some
+frames up to 20 (docs/light_experiments.md)."""
 AGAIN = 3
 """Searches in a row that must find it, not farther apart than GRID_M."""
 FIRST_SEARCHES, SEARCH_EVERY = 24, 4
@@ -48,7 +48,8 @@ SEEN_DEG, SEEN_M = 4.0, 0.2
 """A picture looks through a place with no patch before it, by more than the second value, within this angle: patches
 of .15 m are so far apart at two metres."""
 NEAREST_RAYS = 8
-"""Rays of a patch that tell how far it sees a place: half its rays lie in a hemisphere, so these in 10 degrees."""
+"""Rays of a patch that tell how far it sees a place, those that point nearest there: by 13 degrees beside it at most.
+Of fewer, what patches see changes by jumps where a lamp moves."""
 TABLE = 64
 """Cells along a side of the table that tells which rays these are."""
 _DIFFERENCE_M = 0.15  # over less, what patches see changes by jumps

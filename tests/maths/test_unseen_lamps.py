@@ -10,10 +10,8 @@ import pytest
 
 from protocol.frames import CameraModel
 from server.light.shell.elimination import Regions
-from server.light.shell.emitters import Emitters
 from server.light.shell.objective import step
 from server.light.shell.patches import RAYS, ray_directions
-from server.light.shell.solution import Solution
 from server.light.shell.solver import Solver
 from server.light.shell.switches import Switches
 from server.light.shell.transport import columns_of, emitter_keys
@@ -22,38 +20,10 @@ from server.light.shell.unseen_lamps import AGAIN, BULB_M, Room, lamp_shares
 from server.light.shell.view import View
 from server.maths.sh import spherical_fibonacci
 from tests.scenes.analytic import Floats
-from tests.scenes.shell_room import AWAY, CAMERA, NO_EMITTERS, UP, Lamp, ShellRoom, make_room
+from tests.scenes.lamp_in_air import AMBIENT, RADIANCE, lamps_of, lit_room, solved
+from tests.scenes.shell_room import CAMERA, UP, Lamp, make_room
 
 PLACES = [(1.35, 1.05, 1.35), (2.6, 0.9, 1.0), (0.9, 2.3, 1.7)]
-RADIANCE = 60.0
-"""Of a lamp of BULB_M: 200 times that of what else is not scanned."""
-AMBIENT = (0.3, 0.3, 0.3)
-ENOUGH = AGAIN + 5
-"""Solutions until a lamp is found and has come to its place."""
-
-
-def lit_room(place: tuple[float, float, float], radiance: float = RADIANCE) -> ShellRoom:
-    """A room with a round lamp in its air."""
-    room = make_room(None, AMBIENT)
-    rows = room.patches.used
-    away = np.array(place) - room.patches.positions[rows]
-    squared = (away**2).sum(axis=1)
-    cosine = np.maximum((away * room.patches.normals[rows]).sum(axis=1), 0.0) / np.sqrt(squared)
-    without = AMBIENT[0] * room.transport.shares[rows].sum(axis=1) + room.transport.known[rows].mean(axis=1)
-    brought = radiance * BULB_M**2 * cosine / squared
-    room.patches.logarithms[rows] += np.log1p(brought / without)[:, None]
-    return room
-
-
-def solved(solver: Solver, room: ShellRoom, view: View = AWAY, times: int = ENOUGH) -> Solution:
-    for _ in range(times):
-        solution = solver.solve(room.patches, NO_EMITTERS, room.patches.used, view, UP)
-    assert solution is not None
-    return solution
-
-
-def lamps_of(solution: Solution) -> Emitters:
-    return solution.emitters.only(np.flatnonzero(solution.emitters.is_unseen))
 
 
 def looking_at(place: tuple[float, float, float], half_deg: float = 15.0) -> View:

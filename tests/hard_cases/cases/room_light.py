@@ -13,12 +13,16 @@ from numpy.typing import NDArray
 from server.light.shell.distant import distant_light
 from server.light.shell.objective import step
 from server.light.shell.shell import SIDES
+from server.light.shell.solver import Solver
 from server.light.shell.sources import distant_sources
+from server.light.shell.switches import Switches
 from server.light.shell.transport import Transport
 from server.light.shell.unknowns import Unknowns
 from server.maths.lobes import LOBES
 from server.maths.sh import LUMINANCE
 from tests.hard_cases.catalogue import Family, Found, Trial
+from tests.scenes.lamp_in_air import lamps_of, lit_room
+from tests.scenes.lamp_in_air import solved as solved_often
 from tests.scenes.lights import unit
 from tests.scenes.shell_room import NO_EMITTERS, Lamp, ShellRoom, make_room
 
@@ -28,6 +32,7 @@ ROOM_LIGHT = Family("light of a room", checkable=False)
 STEPS = 25
 LAMP = Lamp((3.0, 0.9), 0.7, (16.0, 15.0, 14.0))
 AMBIENT = (0.3, 0.3, 0.3)
+IN_AIR = (1.35, 1.05, 1.35)
 TOWARDS = unit([0.6, 0.5, 0.6])
 _LINEAR = [3, 1, 2]
 _MODEL = (
@@ -202,3 +207,32 @@ def closed_room(_trial: Trial) -> Found:
 def nothing(_trial: Trial) -> Found:
     estimate = distant_light(Unknowns().solved(), 4)
     return Found(estimate.sh, 0, known=estimate.valid or estimate.std is not None)
+
+
+def _lamp_in_air(noise: float) -> Floats:
+    """[3] where a lamp is found, with this deviation of the logarithms that patches show; far off where none is."""
+    room = lit_room(IN_AIR)
+    used = room.patches.used
+    room.patches.logarithms[used] += noise * np.random.default_rng(7).normal(size=(len(used), 1))
+    lamps = lamps_of(solved_often(Solver(Switches()), room))
+    return lamps.centers[0] if lamps.count == 1 else np.full(3, np.inf)
+
+
+@ROOM_LIGHT.case(
+    "a lamp in the air, and noise",
+    0.15,
+    "m",
+    "a place is looked at in steps of 6 cm, and 5 % of noise moves the best one by two of them at most.",
+)
+def lamp_in_air(_trial: Trial) -> Found:
+    return Found(_lamp_in_air(0.05), np.array(IN_AIR))
+
+
+@ROOM_LIGHT.case(
+    "a lamp in the air, last bits of the pictures",
+    0.01,
+    "m",
+    "a relative change of 1e-6 may choose another of places that are as good, which steps then leave for the same one.",
+)
+def lamp_in_air_last_bits(_trial: Trial) -> Found:
+    return Found(_lamp_in_air(1e-6), _lamp_in_air(0.0))

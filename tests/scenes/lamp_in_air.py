@@ -7,14 +7,14 @@ import numpy as np
 from server.light.shell.emitters import Emitters
 from server.light.shell.solution import Solution
 from server.light.shell.solver import Solver
-from server.light.shell.unseen_lamps import AGAIN, BULB_M
+from server.light.shell.unseen_lamps import AGAIN, BULB_M, YOUNG
 from server.light.shell.view import View
 from tests.scenes.shell_room import AWAY, NO_EMITTERS, UP, ShellRoom, make_room
 
 RADIANCE = 60.0
 """Of a lamp of BULB_M: 200 times that of what else is not scanned."""
 AMBIENT = (0.3, 0.3, 0.3)
-ENOUGH = AGAIN + 5
+ENOUGH = YOUNG + AGAIN + 4
 """Solutions until a lamp is found and has come to its place."""
 
 

@@ -39,11 +39,14 @@ and at its place. In rooms with such a lamp it is 25 to 43 after a second; in ot
 frames up to 20 (docs/light_experiments.md)."""
 AGAIN = 3
 """Searches in a row that must find it, not farther apart than GRID_M."""
-FIRST_SEARCHES, SEARCH_EVERY = 24, 4
-"""Lamps are looked for, and moved, with each of so many first solutions, in a second and a half, and then with every so
-many."""
+YOUNG, FIRST_SEARCHES, SEARCH_EVERY = 5, 24, 4
+"""Lamps are looked for, and moved, after so many solutions, since a lamp at many a place explains a few pictures; then
+with each one until there were so many, in a second and a half; and then with every so many."""
 STEP_M, MOST_STEP_M = 0.2, 0.1
 """Standard deviation of a step of a lamp, and the greatest one."""
+WIDER = 2.0
+"""Steps are so many times as wide as Newton's: what patches see changes by jumps, which curvature takes for more than it
+tells."""
 SEEN_DEG, SEEN_M = 4.0, 0.2
 """A picture looks through a place with no patch before it, by more than the second value, within this angle: patches
 of .15 m are so far apart at two metres."""
@@ -146,7 +149,8 @@ class UnseenLamps:
         for number in [number for number, radiance in sent.items() if radiance < 1.0]:
             del self.centers[number]
         self._solutions += 1
-        if self._solutions > FIRST_SEARCHES and self._solutions % SEARCH_EVERY:
+        is_rare = self._solutions > FIRST_SEARCHES and self._solutions % SEARCH_EVERY
+        if self._solutions <= YOUNG or is_rare:
             return
         for number in self.centers:
             self._move(number, sent[number], room)
@@ -158,7 +162,7 @@ class UnseenLamps:
         ends = room.columns(np.concatenate([center + side * _DIFFERENCE_M * np.eye(3) for side in (1, -1)]))
         columns = np.float32(radiance / (2 * _DIFFERENCE_M)) * (ends[:, :3] - ends[:, 3:])
         slope, curvature = profile(room.unknowns, room.here, columns)
-        step = np.linalg.solve(curvature + np.eye(3) / STEP_M**2, slope)
+        step = WIDER * np.linalg.solve(curvature + np.eye(3) / STEP_M**2, slope)
         moved = center + step * min(1.0, MOST_STEP_M / max(float(np.linalg.norm(step)), 1e-12))
         if room.inside(moved[None])[0] and not self._are_seen(moved[None], room.shell)[0]:
             self.centers[number] = moved

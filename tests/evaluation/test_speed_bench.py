@@ -44,7 +44,7 @@ def test_a_moving_camera_has_all_rows(device: Device, tmp_path: Path) -> None:
         assert rows[f"moving camera, {DEFAULT}: {row}, median"] >= 0
     assert rows[f"moving camera, {DEFAULT}: radiance_transfer, median"] > 0
     assert 20 < rows["moving camera: kernels launched, median"] < 200
-    assert 1 <= rows["moving camera: blocking reads, median"] < 40
+    assert 0 <= rows["moving camera: blocking reads, median"] < 40  # what is there already does not block
     assert 0 < rows["moving camera: host's own time, median"] < rows[f"moving camera, {DEFAULT}: frame, 95 % of them"]
     assert abs(rows["moving camera: share of the frame that no row tells"]) < 0.1
     assert rows["moving camera: frame without caches / with, median"] > 0

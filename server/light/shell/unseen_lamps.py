@@ -204,6 +204,8 @@ def _best(room: Room, places: Floats, may_be: Callable[[Floats], NDArray[np.bool
     for share in FINER:
         around = best + share * GRID_M * np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         around = around[room.inside(around) & may_be(around)]
+        if not len(around):  # a place on the very edge, with seen air inside of it
+            return None
         gains = room.gains(around)
         best = around[gains.argmax()]
     return best if gains.max() >= FOUND else None

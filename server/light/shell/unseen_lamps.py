@@ -45,8 +45,8 @@ with each one until there were so many, in a second and a half; and then with ev
 STEP_M, MOST_STEP_M = 0.2, 0.1
 """Standard deviation of a step of a lamp, and the greatest one."""
 WIDER = 2.0
-"""Steps are so many times as wide as Newton's: what patches see changes by jumps, which curvature takes for more than it
-tells."""
+"""Steps are so many times as wide as Newton's: what patches see changes by jumps, and curvature takes these for
+evidence."""
 SEEN_DEG, SEEN_M = 4.0, 0.2
 """A picture looks through a place with no patch before it, by more than the second value, within this angle: patches
 of .15 m are so far apart at two metres."""
